@@ -1,0 +1,38 @@
+"""Modules that remember the plain arguments they were built with, so that a bundle can rebuild them."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from typing import Any
+
+from torch import nn
+
+
+class RememberedArguments(nn.Module):
+    """An ``nn.Module`` whose subclasses record their keyword arguments in ``self.arguments``.
+
+    The first constructor parameter (a spec or a width, supplied by the package) is left out; everything else must be
+    plain: strings, numbers, booleans, None, and lists or dictionaries of these.
+    """
+
+    arguments: dict[str, Any]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "__init__" not in cls.__dict__:
+            return
+        build = cls.__init__
+        signature = inspect.signature(build)
+
+        @functools.wraps(build)
+        def recording_build(self: RememberedArguments, *args: Any, **given: Any) -> None:
+            if type(self) is cls:
+                bound = signature.bind(self, *args, **given)
+                bound.apply_defaults()
+                arguments = dict(list(bound.arguments.items())[2:])
+            build(self, *args, **given)
+            if type(self) is cls:
+                self.arguments = arguments
+
+        cls.__init__ = recording_build  # type: ignore[method-assign]

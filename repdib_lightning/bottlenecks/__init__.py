@@ -1,0 +1,1 @@
+"""Bottlenecks: the slot between an encoder and an objective."""

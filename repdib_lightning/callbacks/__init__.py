@@ -1,0 +1,1 @@
+"""What watches a run: pictures, codebook use, exact resume, status."""

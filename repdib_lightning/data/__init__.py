@@ -1,0 +1,1 @@
+"""The store, its sampling and loading, and what reads foreign formats."""

@@ -1,0 +1,1 @@
+"""Encoders: a dictionary of observations in, (N, M) out."""

@@ -1,0 +1,1 @@
+"""Environments: where data sets come from."""

@@ -1,0 +1,1 @@
+"""Frozen encoder bundles: safetensors and JSON."""

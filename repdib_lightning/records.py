@@ -1,0 +1,121 @@
+"""The axis legend and every record that crosses a seam of the package.
+
+Axes, used in every docstring:
+
+====  =========================================  ====  ===================================
+``B``  batch (samples)                            ``M``  latent width
+``F``  frames of a sample (anchor, then futures)  ``G``  groups of the quantiser
+``N``  rows of a store, or ``B * F`` flattened     ``L``  codes per group
+``T``  time (rows of an episode)                  ``D``  width of a group, ``M / G``
+``C H W``  channels, height, width of a picture   ``A``  width of a continuous action
+``S``  frames stacked into one observation        ``K``  horizon (largest time offset)
+====  =========================================  ====  ===================================
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from torch import Tensor
+
+Split = Literal["train", "evaluation"]
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """Shape (without B, F, N) and dtype of one observation: ``(S * C, H, W)`` uint8, or ``(X,)`` float32."""
+
+    shape: tuple[int, ...]
+    dtype: Literal["uint8", "float32"] = "uint8"
+
+    @property
+    def is_image(self) -> bool:
+        """Whether this is a channels-first uint8 picture."""
+        return self.dtype == "uint8" and len(self.shape) == 3
+
+
+@dataclass(frozen=True)
+class ActionSpec:
+    """``discrete`` with ``size`` choices (stored as integers), or ``continuous`` with ``size`` = A dimensions."""
+
+    kind: Literal["discrete", "continuous"]
+    size: int
+
+
+@dataclass(frozen=True)
+class DataSpec:
+    """What a model must know of its data: every width in the package is derived from here."""
+
+    observations: dict[str, ArraySpec]
+    actions: ActionSpec | None = None
+    frame_stack: int = 1
+    horizon: int = 1
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionaries, lists, strings and numbers only (JSON)."""
+        plain = asdict(self)
+        for spec in plain["observations"].values():
+            spec["shape"] = list(spec["shape"])
+        return plain
+
+    @classmethod
+    def from_dict(cls, plain: dict[str, Any]) -> DataSpec:
+        """Inverse of :meth:`to_dict`. Raises KeyError or TypeError on missing or unknown fields."""
+        observations = {
+            name: ArraySpec(shape=tuple(spec["shape"]), dtype=spec["dtype"])
+            for name, spec in plain["observations"].items()
+        }
+        actions = None if plain["actions"] is None else ActionSpec(**plain["actions"])
+        return cls(observations, actions, plain["frame_stack"], plain["horizon"])
+
+
+@dataclass
+class Batch:
+    """Samples of B anchors: each anchor row t and F - 1 later rows t + k of the same episode.
+
+    Attributes:
+        observations: name -> (B, F, *shape); ``[:, 0]`` is the anchor o_t, ``[:, i]`` is o_{t+k_i}.
+        actions: (B,) int64 or (B, A) float32, the action taken at the anchor; None in stores without actions.
+        offsets: (B, F) int64, time offsets k in steps; ``offsets[:, 0] == 0``.
+        rows: (B,) int64, the anchor's row in the store.
+    """
+
+    observations: dict[str, Tensor]
+    actions: Tensor | None
+    offsets: Tensor
+    rows: Tensor
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def pin_memory(self) -> Batch:
+        """Called by torch's DataLoader when ``pin_memory`` is on."""
+        actions = None if self.actions is None else self.actions.pin_memory()
+        observations = {name: array.pin_memory() for name, array in self.observations.items()}
+        return Batch(observations, actions, self.offsets.pin_memory(), self.rows.pin_memory())
+
+
+@dataclass
+class BottleneckOutput:
+    """What a bottleneck returns.
+
+    Attributes:
+        latent: (N, M), what objectives, probes and agents use.
+        losses: named scalars, unweighted (weights live in one map, ``loss_weights``).
+        codes: (N, G) int64 indices in [0, L), or None where nothing is quantised.
+        metrics: named detached scalars worth logging.
+    """
+
+    latent: Tensor
+    losses: dict[str, Tensor] = field(default_factory=dict)
+    codes: Tensor | None = None
+    metrics: dict[str, Tensor] = field(default_factory=dict)
+
+
+@dataclass
+class ObjectiveOutput:
+    """What an objective returns: named unweighted scalar losses to minimise, named detached scalars to log."""
+
+    losses: dict[str, Tensor]
+    metrics: dict[str, Tensor] = field(default_factory=dict)
