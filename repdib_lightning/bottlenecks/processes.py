@@ -1,0 +1,47 @@
+"""Agreement between the processes of a distributed run, decided at call time: a single process does nothing.
+
+A quantiser may be built before or after the process group, so nothing here is remembered from construction.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, distributed
+
+
+def several_processes() -> bool:
+    """Whether more than one process trains at this moment."""
+    return distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1
+
+
+def process_count() -> int:
+    """Number of processes that train at this moment."""
+    return distributed.get_world_size() if several_processes() else 1
+
+
+def sum_over_processes(tensor: Tensor) -> Tensor:
+    """Add the tensors of all processes, in place, and return it."""
+    if several_processes():
+        distributed.all_reduce(tensor)
+    return tensor
+
+
+def take_from_first(tensor: Tensor) -> Tensor:
+    """Overwrite the tensor by that of process 0, in place, and return it."""
+    if several_processes():
+        distributed.broadcast(tensor, src=0)
+    return tensor
+
+
+def gather_rows(rows: Tensor) -> Tensor:
+    """Concatenate (N_p, ...) over the processes p, in their order; N_p may differ."""
+    if not several_processes():
+        return rows
+    counts = rows.new_zeros(distributed.get_world_size(), dtype=torch.int64)
+    counts[distributed.get_rank()] = len(rows)
+    distributed.all_reduce(counts)
+    padded = rows.new_zeros(int(counts.max()), *rows.shape[1:])
+    padded[: len(rows)] = rows
+    parts = [torch.empty_like(padded) for _ in range(len(counts))]
+    distributed.all_gather(parts, padded)
+    return torch.cat([part[:count] for part, count in zip(parts, counts.tolist(), strict=True)])

@@ -1,0 +1,60 @@
+"""The latest training latents, kept until a codebook starts on them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from repdib_lightning.bottlenecks.precision import SinglePrecision
+from repdib_lightning.bottlenecks.processes import gather_rows
+from repdib_lightning.errors import UserError
+
+
+class Reservoir(SinglePrecision):
+    """A ring of the last R rows of width M. The latest, because an encoder in training leaves old latents behind.
+
+    Attributes:
+        rows: (R, M), or (0, M) after :meth:`release`, so that checkpoints and bundles do not carry it.
+        seen: () int64, rows added so far.
+    """
+
+    rows: Tensor
+    seen: Tensor
+
+    def __init__(self, capacity: int, width: int) -> None:
+        super().__init__()
+        self.register_buffer("rows", torch.zeros(capacity, width))
+        self.register_buffer("seen", torch.zeros((), dtype=torch.int64))
+
+    @torch.no_grad()
+    def add(self, latent: Tensor) -> None:
+        """Store (N, M), in place of the oldest rows."""
+        capacity = len(self.rows)
+        latent = latent[-capacity:]
+        places = (self.seen + torch.arange(len(latent), device=latent.device)) % capacity
+        self.rows.index_copy_(0, places, latent.to(self.rows.dtype))
+        self.seen += len(latent)
+
+    def collect(self) -> Tensor:
+        """Rows of all processes, at most R, (R', M): the same number from each where they hold the same number."""
+        capacity = len(self.rows)
+        rows = gather_rows(self.rows[: min(capacity, int(self.seen))])
+        return rows[:: -(-len(rows) // capacity)]
+
+    def release(self) -> None:
+        """Forget the rows and free their memory."""
+        self.rows = self.rows.new_zeros(0, self.rows.shape[1])
+
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *rest: Any) -> None:
+        saved = state_dict.get(prefix + "rows")
+        if saved is not None and len(saved) == 0:
+            self.release()
+        elif saved is not None and saved.shape != self.rows.shape:
+            raise UserError(
+                f"codebook: saved before it started, while gathering {len(saved)} rows; the configuration gathers "
+                f"{len(self.rows)} (see start, start_step, codes)"
+            )
+        super()._load_from_state_dict(state_dict, prefix, *rest)
