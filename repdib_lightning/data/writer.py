@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from pathlib import Path
@@ -13,6 +12,7 @@ import h5py
 import numpy as np
 
 from repdib_lightning.data.files import sync_directory, sync_file
+from repdib_lightning.data.fingerprint import ContentHash
 from repdib_lightning.data.schema import FORMAT, SCHEMA_VERSION, FactorSpec
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import ActionSpec, ArraySpec
@@ -59,7 +59,7 @@ class EpisodeWriter:
         self.rows, self.episodes = rows, episodes
         self.observations, self.actions = observations, actions
         self._row = self._episode = 0
-        self._hash = hashlib.blake2b(digest_size=16)
+        self._hash = ContentHash()
         self._temporary = self.path.with_name(f".{self.path.name}.tmp-{os.getpid()}")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -165,10 +165,9 @@ class EpisodeWriter:
             for name, array in arrays.items():
                 dataset = self._file[name]
                 assert array.shape == (length, *dataset.shape[1:]), (name, array.shape, dataset.shape)
-                array = np.ascontiguousarray(array, dtype=dataset.dtype)
-                dataset[rows] = array
-                self._hash.update(name.encode())
-                self._hash.update(array.view(np.uint8).data)
+                arrays[name] = np.ascontiguousarray(array, dtype=dataset.dtype)
+                dataset[rows] = arrays[name]
+            self._hash.add_episode(arrays, evaluation=evaluation)
             self._file["episodes/start"][self._episode] = rows.start
             self._file["episodes/length"][self._episode] = length
             self._file["episodes/evaluation"][self._episode] = evaluation
