@@ -1,1 +1,11 @@
 """Encoders: a dictionary of observations in, (N, M) out."""
+
+from repdib_lightning.encoders.augmentation import random_shift
+from repdib_lightning.encoders.base import Encoder
+from repdib_lightning.encoders.convolutional import ConvolutionalEncoder
+from repdib_lightning.encoders.residual import ResNetEncoder
+
+ENCODERS: dict[str, type[Encoder]] = {cls.__name__: cls for cls in (ConvolutionalEncoder, ResNetEncoder)}
+"""The encoders that a bundle may name."""
+
+__all__ = ["ENCODERS", "ConvolutionalEncoder", "Encoder", "ResNetEncoder", "random_shift"]

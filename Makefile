@@ -1,0 +1,40 @@
+# The first interpreter that runs and is 3.11 or 3.12.
+SUITABLE := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 13))
+PYTHON ?= $(shell for p in python3.11 python3.12 python3; do $$p -c '$(SUITABLE)' 2>/dev/null && echo $$p && break; done)
+BIN := .venv/bin
+RUN := $(BIN)/python -m repdib_lightning
+DEMO := runs/demo
+STEPS ?= 700
+
+.PHONY: install demo test lint clean
+
+install: .venv/installed
+
+# Runs again only when what it installs has changed.
+.venv/installed: pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" && $(PYTHON) -c '$(SUITABLE)' \
+		|| { echo "error: needs Python 3.11 or 3.12; run: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)"; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+# The same encoder without a bottleneck and with RepDIB, on a small recording; what each kept, side by side.
+demo: install
+	rm -rf $(DEMO)
+	test -f data/robot_arm_demo.h5 || $(RUN) collect robot_arm data/robot_arm_demo.h5 --samples 4000
+	for kind in none repdib; do \
+		$(RUN) fit --config robot_arm --config bottleneck/$$kind --config demo --run $(DEMO)/$$kind && \
+		$(RUN) export $(DEMO)/$$kind || exit 1; \
+	done
+	$(RUN) compare data/robot_arm_demo.h5 $(DEMO)/report.html $(DEMO)/none $(DEMO)/repdib
+
+test: install lint
+	$(BIN)/python -m pytest
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy repdib_lightning
+
+clean:
+	rm -rf runs .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,46 @@
+"""Finds the packaged configurations: ``--config robot_arm`` means conf/robot_arm.yaml."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from repdib_lightning.errors import UserError, nearest
+
+
+def packaged() -> dict[str, Path]:
+    """Name (without .yaml, with its folder) -> file of every configuration that ships with the package."""
+    installed, cloned = Path(__file__).parent / "conf", Path(__file__).parents[1] / "conf"
+    root = installed if installed.is_dir() else cloned
+    found = sorted(root.rglob("*.yaml"))
+    return {str(path.relative_to(root).with_suffix("")): path for path in found}
+
+
+def resolve(name: str) -> Path:
+    """The file that a ``--config`` value means: an existing path, else a packaged name.
+
+    Raises:
+        UserError: neither, with the nearest packaged name.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    known = packaged()
+    short = name.removesuffix(".yaml").removeprefix("conf/")
+    if short not in known:
+        raise UserError(f"--config {name}: no such file or packaged configuration; {nearest(short, known)}")
+    return known[short]
+
+
+def expand(arguments: list[str]) -> list[str]:
+    """Replace the value of every ``--config`` (or ``-c``) by the file that it means."""
+    expanded: list[str] = []
+    expects_name = False
+    for argument in arguments:
+        option, equals, value = argument.partition("=")
+        if expects_name:
+            argument = str(resolve(argument))
+        elif option in ("--config", "-c") and equals:
+            argument = f"--config={resolve(value)}"
+        expects_name = not expects_name and argument in ("--config", "-c")
+        expanded.append("--config" if argument == "-c" else argument)
+    return expanded

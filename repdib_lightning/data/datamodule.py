@@ -1,0 +1,112 @@
+"""Data modules: a store, its splits and its loaders, as Lightning wants them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import lightning.pytorch as pl
+import torch
+from torch.utils.data import DataLoader
+
+from repdib_lightning.data.episodes import EpisodeStore
+from repdib_lightning.data.loading import FutureFrames, ResumableLoader, as_it_is
+from repdib_lightning.data.sampling import FutureSampling
+from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.records import ArraySpec, Batch, DataSpec, Split
+
+
+class EpisodeDataModule(pl.LightningDataModule):
+    """Anchor frames with futures from any store.
+
+    Args:
+        path: the store, an HDF5 file made by ``collect`` or ``import``.
+        batch_size: anchors B of a step, over all processes; a step encodes B * (1 + futures) frames.
+        horizon: K, the largest time offset between an anchor and its futures, in steps. 1 gives one-step pairs.
+        futures: futures drawn for each anchor.
+        frame_stack: S, frames stacked into one observation.
+        views: observations to use; all by default.
+        workers: loader processes; 0 reads in the training process, which is best while the file fits in memory.
+        seed: of the order of samples.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        batch_size: int = 128,
+        horizon: int = 5,
+        futures: int = 1,
+        frame_stack: int = 1,
+        views: list[str] | None = None,
+        workers: int = 0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.path = Path(path)
+        self.batch_size, self.horizon, self.futures = batch_size, horizon, futures
+        self.frame_stack, self.views, self.workers, self.seed = frame_stack, views, workers, seed
+        for name in ("batch_size", "horizon", "futures", "frame_stack"):
+            if getattr(self, name) < 1:
+                raise UserError(f"data.{name} must be at least 1, is {getattr(self, name)}")
+        if workers < 0 or seed < 0:
+            raise UserError(f"data.workers and data.seed must not be negative, are {workers} and {seed}")
+        self.store: EpisodeStore | None = None
+
+    def setup(self, stage: str | None = None) -> None:
+        """Open and validate the store. Raises UserError, naming file and key, where something is wrong."""
+        if self.store is not None:
+            return
+        store = EpisodeStore(self.path)
+        for view in self.views or []:
+            if view not in store.observations:
+                raise UserError(f"{self.path}: has no observation '{view}' {nearest(view, store.observations)}")
+        self.store = store
+        self._training = self._sampling("train")
+        self._evaluation = self._sampling("evaluation")
+
+    def _sampling(self, split: Split) -> FutureSampling:
+        assert self.store is not None
+        return FutureSampling(self.store, split, horizon=self.horizon, futures=self.futures, seed=self.seed)
+
+    @property
+    def spec(self) -> DataSpec:
+        """What a model must know of the data. Only after :meth:`setup`."""
+        assert self.store is not None, "setup() opens the store first"
+        views = self.views or list(self.store.observations)
+        observations = {}
+        for name in views:
+            array = self.store.observations[name]
+            shape = (array.shape[0] * self.frame_stack, *array.shape[1:])
+            observations[name] = ArraySpec(shape, array.dtype)
+        return DataSpec(observations, self.store.actions_spec, self.frame_stack, self.horizon)
+
+    def train_dataloader(self) -> ResumableLoader:
+        """Shuffled anchors of the training episodes, resumable at any batch."""
+        rank, world_size = self._place()
+        return ResumableLoader(
+            self._frames(self._training),
+            self.batch_size,
+            workers=self.workers,
+            rank=rank,
+            world_size=world_size,
+            pin_memory=torch.cuda.is_available(),
+        )
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        """Anchors of the evaluation episodes, each once, in the same order each time."""
+        dataset = self._frames(self._evaluation)
+        rank, world_size = self._place()
+        numbers = range(rank, len(dataset), world_size)
+        share = max(1, self.batch_size // world_size)
+        batches = [list(numbers[i : i + share]) for i in range(0, len(numbers), share)]
+        return DataLoader(dataset, batch_sampler=batches, collate_fn=as_it_is, num_workers=self.workers)
+
+    def test_dataloader(self) -> DataLoader[Batch]:
+        """Same as :meth:`val_dataloader`."""
+        return self.val_dataloader()
+
+    def _place(self) -> tuple[int, int]:
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    def _frames(self, sampling: FutureSampling) -> FutureFrames:
+        assert self.store is not None
+        return FutureFrames(self.store, sampling, self.frame_stack, self.views or list(self.store.observations))

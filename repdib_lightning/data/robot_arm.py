@@ -1,0 +1,39 @@
+"""The default data: the simulated robot arm, collected on first use."""
+
+from __future__ import annotations
+
+from repdib_lightning.data.datamodule import EpisodeDataModule
+
+
+class RobotArmDataModule(EpisodeDataModule):
+    """The robot arm of the paper's robot experiment; the file is collected first if it does not exist.
+
+    Args:
+        path: the store.
+        samples: actions to record where the file has to be collected (paper: 14,000).
+        collection_seed: of that recording.
+        batch_size, horizon, futures, frame_stack, views, workers, seed: see :class:`EpisodeDataModule`.
+    """
+
+    def __init__(
+        self,
+        path: str = "data/robot_arm.h5",
+        samples: int = 14_000,
+        collection_seed: int = 0,
+        batch_size: int = 128,
+        horizon: int = 5,
+        futures: int = 1,
+        frame_stack: int = 1,
+        views: list[str] | None = None,
+        workers: int = 0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(path, batch_size, horizon, futures, frame_stack, views, workers, seed)
+        self.samples, self.collection_seed = samples, collection_seed
+
+    def prepare_data(self) -> None:
+        """Collect the recording if there is none (about two minutes on two cores)."""
+        if not self.path.exists():
+            from repdib_lightning.environments.collect import collect_robot_arm  # needs MuJoCo; reading does not
+
+            collect_robot_arm(self.path, samples=self.samples, seed=self.collection_seed)

@@ -1,0 +1,101 @@
+"""Which rows make a sample: index arithmetic on a store, and nothing else.
+
+Everything drawn is a function of (seed, sample number): workers, ranks and restarts change nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from repdib_lightning.data.episodes import EpisodeStore
+from repdib_lightning.errors import UserError
+from repdib_lightning.records import Split
+
+
+def stacked_rows(store: EpisodeStore, rows: np.ndarray, frame_stack: int) -> np.ndarray:
+    """Rows of each frame stack, oldest first; before an episode's start its first row is repeated.
+
+    Args:
+        store: where the rows live.
+        rows: (n,) int64, the newest frame of each stack.
+        frame_stack: S.
+
+    Returns:
+        (n, S) int64.
+    """
+    first = store.starts[store.row_episodes[rows]]
+    return np.maximum(rows[:, None] - np.arange(frame_stack - 1, -1, -1), first[:, None])
+
+
+def gather_stacks(store: EpisodeStore, name: str, rows: np.ndarray, frame_stack: int) -> np.ndarray:
+    """Observations of the given rows with S frames as channels: (n,) int64 -> (n, S * C, ...)."""
+    if frame_stack == 1:
+        return store.gather(f"observations/{name}", rows)
+    stacks = store.gather(f"observations/{name}", stacked_rows(store, rows, frame_stack).reshape(-1))
+    return stacks.reshape(len(rows), -1, *stacks.shape[2:])
+
+
+class FutureSampling:
+    """An endless stream of samples: anchors t, each with n futures t + k, k uniform in 1..K.
+
+    Each epoch visits every anchor once, in an order drawn from (seed, epoch). An anchor is a row with at least K
+    later rows in its episode, so that k is uniform for all of them (AC-State, Lamb et al. 2022; paper section 4.4).
+
+    Args:
+        store: the data.
+        split: which episodes.
+        horizon: K.
+        futures: n, so a sample has F = 1 + n frames.
+        seed: of the stream.
+
+    Raises:
+        UserError: an episode is not longer than the horizon, or the split is empty.
+    """
+
+    def __init__(self, store: EpisodeStore, split: Split, *, horizon: int, futures: int, seed: int) -> None:
+        if horizon < 1 or futures < 1:
+            raise UserError(f"horizon ({horizon}) and futures ({futures}) must be at least 1")
+        episodes = store.episodes(split)
+        if not len(episodes):
+            raise UserError(f"{store.path}: has no episode for {split}")
+        short = episodes[store.lengths[episodes] <= horizon]
+        if len(short):
+            steps = store.lengths[short[0]] - 1
+            raise UserError(
+                f"{store.path}: episode {short[0]} has {steps} steps, fewer than the horizon {horizon}; "
+                f"the largest valid horizon is {int(store.lengths[episodes].min()) - 1}"
+            )
+        spans = [np.arange(store.starts[e], store.starts[e] + store.lengths[e] - horizon) for e in episodes]
+        self.anchors = np.concatenate(spans)
+        self.horizon, self.futures, self.seed = horizon, futures, seed
+        self._epoch = -1
+
+    def __len__(self) -> int:
+        """Samples of one epoch."""
+        return len(self.anchors)
+
+    def draw(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and offsets of samples given by their numbers in the stream.
+
+        Args:
+            numbers: (n,) int64, epoch * len(self) + position.
+
+        Returns:
+            anchor rows (n,) int64, and offsets (n, F) int64 with a leading 0.
+        """
+        epochs, positions = np.divmod(numbers, len(self))
+        rows = np.empty(len(numbers), np.int64)
+        offsets = np.zeros((len(numbers), 1 + self.futures), np.int64)
+        for epoch in np.unique(epochs):
+            self._prepare(int(epoch))
+            here = epochs == epoch
+            rows[here] = self._order[positions[here]]
+            offsets[here, 1:] = self._offsets[positions[here]]
+        return rows, offsets
+
+    def _prepare(self, epoch: int) -> None:
+        if epoch != self._epoch:
+            generator = np.random.Generator(np.random.Philox(key=np.array([self.seed, epoch], np.uint64)))
+            self._order = generator.permutation(self.anchors)
+            self._offsets = generator.integers(1, self.horizon + 1, (len(self), self.futures))
+            self._epoch = epoch

@@ -1,0 +1,66 @@
+"""Turns what the option parser says of bad input into one line with the nearest valid choice."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from collections.abc import Iterable
+
+from repdib_lightning.errors import UserError, nearest
+
+
+def one_line(error: BaseException, options: Iterable[str], classes: dict[str, list[str]]) -> UserError:
+    """Rewrite a parser's error.
+
+    Args:
+        error: what jsonargparse raised.
+        options: all dotted keys that the parser knows, without dashes.
+        classes: key of a slot -> class names that it takes.
+    """
+    text = str(error)
+    keys = re.findall(r'Parser key "([^"]+)"', text)
+    key = _join(keys)
+    known = list(options)
+    if match := re.search(r"unrecognized arguments: (\S+)", text):
+        return UserError(f"unknown option {match[1]}: {_nearest_option(match[1], known)}")
+    if match := re.search(r"Group '([^']*)' does not accept (?:option|nested key) '([^']+)'", text):
+        inside = [name.removeprefix(match[1] + ".") for name in known if name.startswith(match[1] + ".")]
+        return UserError(f"unknown key {match[1]}.{match[2]}: {nearest(match[2], {i.split('.')[0] for i in inside})}")
+    if match := re.search(r"Option '([^']+)' is not accepted", text):
+        return UserError(f"unknown key {key}.{match[1]}: {nearest(match[1], _accepted(text))}")
+    if match := re.search(r"Expected a dot import path string: (\S+)", text):
+        return UserError(f"{key}: unknown class '{match[1]}' {nearest(match[1], classes.get(keys[0], []))}")
+    if match := re.search(r"Expected an? (?:<class ')?([\w.]+)'?>?\. Got value: (.*)", text):
+        return UserError(f"{key}: expected {match[1]}, got '{match[2].split(' Got value')[0].strip().rstrip('.')}'")
+    if match := re.search(r"(?:Errors:\s*|expects a function or a callable class: )-? ?(.+)", text):
+        return UserError(_unwrap(match[1]) if not keys else f"{key}: {_unwrap(match[1])}")
+    return UserError(f"{key}: {_unwrap(text)}" if key and key not in text.splitlines()[-1] else _unwrap(text))
+
+
+def _join(keys: list[str]) -> str:
+    """['data', 'batch_size'] -> 'data.batch_size'; a key that already holds its parent stands alone."""
+    joined = ""
+    for key in keys:
+        joined = key if not joined or key.startswith(joined) else f"{joined}.{key}"
+    return joined
+
+
+def _nearest_option(given: str, known: list[str]) -> str:
+    word = given.lstrip("-").split("=")[0]
+    hint = nearest(word, known)
+    return hint.split("? ")[0].replace("did you mean '", "did you mean '--") + "?" if "? " in hint else hint
+
+
+def _accepted(text: str) -> list[str]:
+    match = re.search(r"class_path='?([\w.]+)", text) or re.search(r"class_path '([\w.]+)'", text)
+    if match is None:
+        return []
+    module, _, name = match[1].rpartition(".")
+    signature = inspect.signature(getattr(importlib.import_module(module), name))
+    return [word for word in signature.parameters if word not in ("spec", "width", "params")]
+
+
+def _unwrap(text: str) -> str:
+    lines = [line.strip(" -") for line in text.splitlines() if line.strip()]
+    return re.sub(r"Parser key \"[^\"]+\":\s*", "", lines[0] if len(lines) == 1 else " ".join(lines[:3]))

@@ -1,0 +1,159 @@
+"""THE LightningModule: an encoder, a bottleneck and a self-supervised objective."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.cli import OptimizerCallable
+from torch import Tensor
+
+from repdib_lightning.bottlenecks.base import Bottleneck
+from repdib_lightning.encoders.augmentation import random_shift
+from repdib_lightning.encoders.base import Encoder
+from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.objectives.base import Objective
+from repdib_lightning.records import Batch, BottleneckOutput, DataSpec, ObjectiveOutput
+
+DEFAULT_LOSS_WEIGHTS = {"kl": 0.01, "commitment": 0.25}
+"""Paper: VIB coefficient 0.01 (all three tables); VQ-VAE: commitment 0.25. Every other term weighs 1."""
+
+
+class RepresentationModule(pl.LightningModule):
+    """Learns a representation from a data module that offers a ``spec``.
+
+    The parts are built in :meth:`configure_model`, once the data is known and the process group stands, so that a
+    configuration states each width once.
+
+    Args:
+        encoder: builds the encoder from the data's spec.
+        bottleneck: builds the bottleneck from the width M.
+        objective: builds the objective from M and the spec.
+        optimizer: builds the optimiser from the parameters.
+        loss_weights: weight of each named loss term; unnamed ones keep their default (kl 0.01, commitment 0.25,
+            all others 1).
+        warmup: term -> steps over which its weight rises linearly from 0.
+        shift: random shift of the pictures while training, in pixels (DrQ-v2: 4 at 84 px); 0 turns it off.
+    """
+
+    encoder: Encoder
+    bottleneck: Bottleneck
+    objective: Objective
+
+    def __init__(
+        self,
+        encoder: Callable[[DataSpec], Encoder],
+        bottleneck: Callable[[int], Bottleneck],
+        objective: Callable[[int, DataSpec], Objective],
+        optimizer: OptimizerCallable = torch.optim.Adam,
+        loss_weights: dict[str, float] | None = None,
+        warmup: dict[str, int] | None = None,
+        shift: int = 4,
+    ) -> None:
+        super().__init__()
+        self.build_encoder, self.build_bottleneck, self.build_objective = encoder, bottleneck, objective
+        self.build_optimizer = optimizer
+        self.loss_weights = {**DEFAULT_LOSS_WEIGHTS, **(loss_weights or {})}
+        self.named_weights = sorted({*(loss_weights or {}), *(warmup or {})})
+        self.warmup = warmup or {}
+        self.shift = shift
+        if shift < 0:
+            raise UserError(f"model.shift must not be negative, is {shift}")
+
+    def configure_model(self) -> None:
+        """Build encoder, bottleneck and objective from the data module's spec (once)."""
+        if hasattr(self, "encoder"):
+            return
+        self.build(self.trainer.datamodule.spec)
+
+    def build(self, spec: DataSpec) -> RepresentationModule:
+        """Build the parts for data of this spec; for use without a trainer."""
+        self.encoder = self.build_encoder(spec)
+        self.bottleneck = self.build_bottleneck(self.encoder.features)
+        self.objective = self.build_objective(self.encoder.features, spec)
+        return self
+
+    def configure_optimizers(self) -> Any:
+        """One optimiser over all parameters."""
+        return self.build_optimizer(self.parameters())
+
+    def forward(self, observations: dict[str, Tensor]) -> BottleneckOutput:
+        """Pass name -> (N, *shape) through encoder and bottleneck, without augmentation."""
+        output: BottleneckOutput = self.bottleneck(self.encoder(observations))
+        return output
+
+    def training_step(self, batch: Batch, batch_index: int) -> dict[str, Any]:
+        """Return the weighted sum as ``loss`` and the raw terms as ``terms``."""
+        output = self._evaluate(batch)
+        terms = {name: value * self._weight(name) for name, value in output.losses.items()}
+        loss = torch.stack(list(terms.values())).sum()
+        self._log("train", batch, loss, output, terms)
+        return {"loss": loss, "terms": {name: value.detach() for name, value in output.losses.items()}}
+
+    def validation_step(self, batch: Batch, batch_index: int) -> None:
+        """Log the same terms for held-out episodes."""
+        self._log_held_out("val", batch)
+
+    def test_step(self, batch: Batch, batch_index: int) -> None:
+        """Log the same terms for held-out episodes."""
+        self._log_held_out("test", batch)
+
+    def _log_held_out(self, stage: str, batch: Batch) -> None:
+        output = self._evaluate(batch)
+        terms = {name: value * self.loss_weights.get(name, 1.0) for name, value in output.losses.items()}
+        self._log(stage, batch, torch.stack(list(terms.values())).sum(), output, terms)
+
+    def _evaluate(self, batch: Batch) -> ObjectiveOutput:
+        """All unweighted losses and metrics of one batch; the objective encodes exactly once."""
+        bottlenecks: list[BottleneckOutput] = []
+
+        def encode(observations: dict[str, Tensor]) -> Tensor:
+            assert not bottlenecks, "an objective encodes all its frames in one pass"
+            lead = next(iter(observations.values())).shape[:2]
+            flat = {name: self._augment(array.flatten(0, 1)) for name, array in observations.items()}
+            output = self(flat)
+            bottlenecks.append(output)
+            return output.latent.unflatten(0, lead)
+
+        objective: ObjectiveOutput = self.objective(batch, encode)
+        for output in bottlenecks:
+            objective.losses |= output.losses
+            objective.metrics |= output.metrics
+        self._check_names(objective.losses)
+        return objective
+
+    def _augment(self, observation: Tensor) -> Tensor:
+        picture = observation.dtype == torch.uint8 and observation.ndim == 4
+        return random_shift(observation, self.shift) if self.training and picture else observation
+
+    def _check_names(self, losses: dict[str, Tensor]) -> None:
+        for name in self.named_weights:
+            if name not in losses:
+                raise UserError(f"model.loss_weights: no loss is called '{name}' in this run {nearest(name, losses)}")
+
+    def _weight(self, name: str) -> float:
+        steps = self.warmup.get(name, 0)
+        share = min(1.0, (self.global_step + 1) / steps) if steps else 1.0
+        return self.loss_weights.get(name, 1.0) * share
+
+    def _log(
+        self, stage: str, batch: Batch, loss: Tensor, output: ObjectiveOutput, terms: dict[str, Tensor]
+    ) -> None:
+        values = {f"{stage}/loss": loss.detach()}
+        values |= {f"{stage}/raw/{name}": value.detach() for name, value in output.losses.items()}
+        values |= {f"{stage}/weighted/{name}": value.detach() for name, value in terms.items()}
+        values |= {f"{stage}/{name}": value for name, value in output.metrics.items()}
+        held_out = stage != "train"
+        shown = {f"{stage}/loss", f"{stage}/action_accuracy"}
+        for name, value in values.items():
+            self.log(
+                name,
+                value,
+                prog_bar=name in shown,
+                on_step=not held_out,
+                on_epoch=held_out,
+                batch_size=len(batch),
+                sync_dist=held_out,
+            )

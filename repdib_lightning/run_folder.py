@@ -1,0 +1,90 @@
+"""One folder a run: the whole configuration, versions and the data's fingerprint, beside its logs and checkpoints."""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+from lightning.pytorch.callbacks import Callback
+
+from repdib_lightning.data.files import whole_file
+from repdib_lightning.errors import UserError, nearest
+
+CONFIGURATION = "config.yaml"
+_VERSIONED = ("repdib_lightning", "torch", "torchvision", "lightning", "numpy", "h5py", "mujoco", "dm_control")
+
+
+class RunFolder(Callback):
+    """Makes the run's folder when training really starts: after the data, the model and the options are found good.
+
+    Args:
+        folder: runs/<name>.
+        configuration: the whole configuration as YAML.
+        resumed: the folder exists and goes on.
+    """
+
+    def __init__(self, folder: Path, configuration: str, *, resumed: bool) -> None:
+        self.folder, self.configuration, self.resumed = folder, configuration, resumed
+
+    def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Write config.yaml and environment.json. Raises UserError where the folder cannot be made."""
+        if not trainer.is_global_zero:
+            return
+        make_folder(self.folder, exist_ok=self.resumed)
+        with whole_file(self.folder / CONFIGURATION) as path:
+            path.write_text(self.configuration)
+        if not self.resumed:
+            store = trainer.datamodule.store  # type: ignore[attr-defined]
+            facts = {"versions": versions(), "data": {"file": store.path.name, "fingerprint": store.fingerprint}}
+            with whole_file(self.folder / "environment.json") as path:
+                path.write_text(json.dumps(facts, indent=1) + "\n")
+
+
+def default_folder(configurations: list[str]) -> Path:
+    """runs/<names of the configurations>-<date>-<time>."""
+    names = [Path(name).stem for name in configurations] or ["robot_arm"]
+    return Path("runs") / f"{'-'.join(names)}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def make_folder(folder: Path, *, exist_ok: bool) -> None:
+    """Create a run's folder. Raises UserError if it exists already (unless that is wanted) or cannot be made."""
+    check_new(folder, exist_ok=exist_ok)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".write-test"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written ({error.strerror or error})") from error
+
+
+def check_new(folder: Path, *, exist_ok: bool = False) -> None:
+    """Raise UserError if a new run's folder exists and is not empty."""
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: is a file, a run needs a folder; choose another --run")
+    if not exist_ok and folder.is_dir() and any(folder.iterdir()):
+        raise UserError(f"{folder}: exists already; choose another --run, or go on with --resume {folder}")
+
+
+def existing(folder: Path) -> Path:
+    """Return the folder of a run that can go on. Raises UserError with the nearest run otherwise."""
+    if not (folder / CONFIGURATION).is_file():
+        runs = [str(path.parent) for path in folder.parent.glob(f"*/{CONFIGURATION}")] if folder.parent.is_dir() else []
+        raise UserError(f"{folder}: no such run ({CONFIGURATION} is missing); {nearest(str(folder), runs)}")
+    return folder
+
+
+def versions() -> dict[str, Any]:
+    """Versions of Python and of the packages that a result depends on."""
+    found: dict[str, Any] = {"python": platform.python_version()}
+    for name in _VERSIONED:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found

@@ -1,0 +1,97 @@
+"""The verbs that do not train: plain typed functions, their options read from their signatures."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from repdib_lightning.errors import UserError, nearest
+
+
+def collect(arguments: list[str]) -> int:
+    """``collect ENVIRONMENT PATH [options]``."""
+    from repdib_lightning.environments.collect import COLLECTORS
+
+    name, rest = _choose("collect", "environment", COLLECTORS, arguments)
+    print(f"wrote {_call(f'collect {name}', _load(COLLECTORS[name]), rest)}")
+    return 0
+
+
+def import_data(arguments: list[str]) -> int:
+    """``import FORMAT SOURCE OUTPUT [options]``."""
+    from repdib_lightning.data.importers import IMPORTERS
+
+    name, rest = _choose("import", "format", IMPORTERS, arguments)
+    print(f"wrote {_call(f'import {name}', _load(IMPORTERS[name]), rest)}")
+    return 0
+
+
+def inspect(arguments: list[str]) -> int:
+    """``inspect FILE [options]``."""
+    from repdib_lightning.data.inspection import inspect_store
+
+    print(_call("inspect", inspect_store, arguments))
+    return 0
+
+
+def export(arguments: list[str]) -> int:
+    """``export RUN [options]``."""
+    from repdib_lightning.export.run_export import export_run
+
+    folder = _call("export", export_run, arguments)
+    print(f"wrote {folder}    use it: repdib_lightning.export.load_encoder('{folder}')")
+    return 0
+
+
+def probe(arguments: list[str]) -> int:
+    """``probe BUNDLE DATA [options]``."""
+    from repdib_lightning.evaluation.probe import probe_bundle
+
+    print(_call("probe", probe_bundle, arguments).table())
+    return 0
+
+
+def compare(arguments: list[str]) -> int:
+    """``compare DATA OUTPUT BUNDLE [BUNDLE ...]``."""
+    from repdib_lightning.evaluation.compare import compare as compare_bundles
+
+    print(_call("compare", compare_bundles, arguments))
+    return 0
+
+
+def _choose(verb: str, what: str, known: dict[str, str], arguments: list[str]) -> tuple[str, list[str]]:
+    """The first argument, one of ``known``, and the rest. ``--help`` alone lists the choices."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        listing = "\n".join(f"  {name}" for name in sorted(known))
+        print(f"usage: python -m repdib_lightning {verb} {what.upper()} ... (--help after it lists its options)\n{listing}")
+        raise SystemExit(0 if arguments else 2)
+    if arguments[0] not in known:
+        raise UserError(f"{verb}: unknown {what} '{arguments[0]}': {nearest(arguments[0], known)}")
+    return arguments[0], arguments[1:]
+
+
+def _load(place: str) -> Callable[..., Any]:
+    module, _, function = place.partition(":")
+    return getattr(importlib.import_module(module), function)  # type: ignore[no-any-return]
+
+
+def _call(verb: str, function: Callable[..., Any], arguments: list[str]) -> Any:
+    """Call a function with what its signature reads from the arguments: required ones by place, others by name."""
+    from jsonargparse import ArgumentParser
+
+    from repdib_lightning.option_errors import one_line
+
+    description = (function.__doc__ or "").strip().split("\n\n")[0]
+    parser = ArgumentParser(
+        prog=f"python -m repdib_lightning {verb}", description=description, exit_on_error=False, allow_abbrev=False
+    )
+    parser.add_function_arguments(function, as_group=False, as_positional=True, fail_untyped=True)
+    try:
+        options = parser.parse_args(arguments)
+    except argparse.ArgumentError as error:
+        known = [option[2:] for action in parser._actions for option in action.option_strings if option[:2] == "--"]
+        raise one_line(error, known, {}) from error
+    return function(**parser.instantiate(options).as_dict())
