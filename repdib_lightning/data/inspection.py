@@ -67,6 +67,8 @@ def inspect_store(path: Path, *, contact_sheet: Path | None = None, verify: bool
     foreign = describe_foreign(path)
     if foreign is not None:
         return Inspection(foreign)
+    if path.is_dir():
+        raise UserError(f"{path}: a folder in which no import finds its files (expected: *.npz, *.hdf5 or a *.csv)")
     store = EpisodeStore(path)
     checked = _verify(store) if verify else ""
     samples = _sample(store)

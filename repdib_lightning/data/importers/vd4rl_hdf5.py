@@ -24,6 +24,7 @@ from repdib_lightning.data.importers.recorded import (
     check_image,
     numbers,
 )
+from repdib_lightning.data.schema import FORMAT
 from repdib_lightning.data.sequential import SequentialRows
 from repdib_lightning.errors import UserError
 
@@ -98,6 +99,8 @@ class _Shard:
     """One open file whose small arrays are in memory."""
 
     def __init__(self, path: Path, file: h5py.File) -> None:
+        if file.attrs.get("format") == FORMAT:
+            raise UserError(f"{path}: is a store of this package already; nothing to import")
         for key in _KEYS:
             if not isinstance(file.get(key), h5py.Dataset):
                 raise UserError(f"{path}: key '{key}' is missing (it holds: {', '.join(file) or 'nothing'})")
