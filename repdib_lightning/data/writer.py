@@ -79,9 +79,7 @@ class EpisodeWriter:
         status = os.statvfs(self.path.parent)
         if needed > status.f_bavail * status.f_frsize:
             free = status.f_bavail * status.f_frsize / 2**20
-            raise UserError(
-                f"{self.path}: cannot be written (needs {needed / 2**20:.0f} MiB, {free:.0f} MiB are free)"
-            )
+            raise UserError(f"{self.path}: cannot be written (needs {needed / 2**20:.0f} MiB, {free:.0f} MiB are free)")
 
     def _cannot_write(self, error: OSError) -> UserError:
         return UserError(f"{self.path}: cannot be written ({error.strerror or error})")
@@ -99,9 +97,7 @@ class EpisodeWriter:
         kind = h5py.h5t.py_create(np.dtype(dtype), logical=True)
         return h5py.Dataset(h5py.h5d.create(parent.id, leaf, kind, space, layout))
 
-    def _allocate(
-        self, factors: dict[str, FactorSpec], masks: dict[str, tuple[int, int]], rewards: bool
-    ) -> None:
+    def _allocate(self, factors: dict[str, FactorSpec], masks: dict[str, tuple[int, int]], rewards: bool) -> None:
         for name, spec in self.observations.items():
             self._dataset(f"observations/{name}", (self.rows, *spec.shape), spec.dtype)
         if self.actions is not None:
