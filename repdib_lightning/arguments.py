@@ -35,4 +35,4 @@ class RememberedArguments(nn.Module):
             if type(self) is cls:
                 self.arguments = arguments
 
-        cls.__init__ = recording_build  # type: ignore[method-assign]
+        cls.__init__ = recording_build  # type: ignore[assignment, method-assign]

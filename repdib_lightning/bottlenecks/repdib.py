@@ -19,7 +19,8 @@ class RepDIB(Bottleneck):
     """:class:`Variational`, then :class:`VectorQuantiser` on what it gives, without a normalisation between.
 
     Losses and metrics are those of both; evaluation quantises the mean. The options are theirs, described there; one
-    is added.
+    is added. The nearest to the paper's words, where they are silent to VQ-VAE's: ``codebook="gradient"``,
+    ``start="random"``, ``start_step=0``, ``revive_after=0``, with a weight of 0.01 on ``kl`` (either reduction).
 
     Args:
         width: M.

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from repdib_lightning.bottlenecks.precision import SinglePrecision
 from repdib_lightning.bottlenecks.processes import gather_rows
-from repdib_lightning.errors import UserError
 
 
 class Reservoir(SinglePrecision):
@@ -46,15 +45,14 @@ class Reservoir(SinglePrecision):
 
     def release(self) -> None:
         """Forget the rows and free their memory."""
-        self.rows = self.rows.new_zeros(0, self.rows.shape[1])
+        self._resize(0)
+
+    def _resize(self, capacity: int) -> None:
+        # In place: whoever holds this buffer (distributed training does) must not keep the old memory alive.
+        self.rows.data = self.rows.new_zeros(capacity, self.rows.shape[1])
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *rest: Any) -> None:
         saved = state_dict.get(prefix + "rows")
-        if saved is not None and len(saved) == 0:
-            self.release()
-        elif saved is not None and saved.shape != self.rows.shape:
-            raise UserError(
-                f"codebook: saved before it started, while gathering {len(saved)} rows; the configuration gathers "
-                f"{len(self.rows)} (see start, start_step, codes)"
-            )
+        if saved is not None and len(saved) != len(self.rows):
+            self._resize(len(saved))
         super()._load_from_state_dict(state_dict, prefix, *rest)

@@ -20,6 +20,7 @@ from repdib_lightning.records import BottleneckOutput
 _RULES = ("ema", "gradient")
 _STARTS = ("kmeans", "random")
 _ROWS_PER_CODE = 40
+_ROWS_AT_MOST = 8192
 
 
 class VectorQuantiser(Bottleneck):
@@ -43,8 +44,8 @@ class VectorQuantiser(Bottleneck):
         codebook: ``ema``: running averages; ``gradient``: a parameter, trained by the loss ``codebook``.
         shared: one book for all groups instead of one a group. The paper's notation allows both readings.
         decay: of the running averages, 0 <= decay < 1; memory of about 1 / (1 - decay) steps. ``ema`` only.
-        start: ``kmeans``: codes start as cluster centres of the latest training latents (40 rows a code, all
-            processes); ``random``: drawn from N(0, I), the prior of the VIB.
+        start: ``kmeans``: codes start as cluster centres of the latest training latents (40 a code, 8192
+            at most, of all processes); ``random``: drawn from N(0, I), the prior of the VIB.
         start_step: training steps that pass the input through before quantising starts. With 0 and ``random`` it
             quantises from the beginning; with 0 and ``kmeans`` it starts on the first batch alone.
         revive_after: a code that nothing chose for this many training steps moves onto a random row of the batch;
@@ -86,8 +87,8 @@ class VectorQuantiser(Bottleneck):
         books = 1 if shared else groups
         self.book = Codebook(books, codes, width // groups, rule=codebook, decay=decay, revive_after=revive_after)
         begins = start == "random" and start_step == 0
-        capacity = _ROWS_PER_CODE * codes if start == "kmeans" else 0
-        self.reservoir = Reservoir(capacity, width)
+        self._capacity = min(_ROWS_PER_CODE * codes, _ROWS_AT_MOST) if start == "kmeans" else 0
+        self.reservoir = Reservoir(self._capacity, width)
         self.register_buffer("started", torch.tensor(begins))
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
         # Plain copies of the two buffers: branching on a tensor would wait for the device and break compilation.
@@ -189,10 +190,15 @@ class VectorQuantiser(Bottleneck):
         self.started.fill_(True)
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *rest: Any) -> None:
+        started, gathered = state_dict.get(prefix + "started"), state_dict.get(prefix + "reservoir.rows")
+        if started is not None and gathered is not None and not started and len(gathered) != self._capacity:
+            raise UserError(
+                f"{type(self).__name__}: saved before it started, while it kept {len(gathered)} rows to start from; "
+                f"the configuration keeps {self._capacity} (see start and codes)"
+            )
         super()._load_from_state_dict(state_dict, prefix, *rest)
-        if prefix + "started" in state_dict:
-            self._started = bool(state_dict[prefix + "started"])
-            self._steps = int(state_dict[prefix + "steps"])
+        if started is not None:
+            self._started, self._steps = bool(started), int(state_dict[prefix + "steps"])
 
     def _check_shape(self, width: int, groups: int, codes: int) -> None:
         self._check_range("groups", groups, groups >= 1, "at least 1")
