@@ -1,0 +1,105 @@
+"""From a run folder to a bundle: what a run writes of its model at the start, and the verb ``export RUN``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from repdib_lightning.bottlenecks.base import Bottleneck
+from repdib_lightning.data.files import whole_file
+from repdib_lightning.encoders.base import Encoder
+from repdib_lightning.errors import UserError
+from repdib_lightning.export.bundle import save_bundle
+from repdib_lightning.export.description import as_text, bundle_config, sealed
+from repdib_lightning.export.rebuild import fill, read_description, rebuild
+
+MODEL_DESCRIPTION = "bundle.json"
+"""The file of a run folder that says how to rebuild its encoder and bottleneck."""
+
+
+def write_model_description(
+    run_folder: str | Path,
+    encoder: Encoder,
+    bottleneck: Bottleneck,
+    *,
+    training: Mapping[str, Any],
+    data: Mapping[str, Any],
+) -> Path:
+    """Write ``bundle.json``, once the modules are built, so that any later checkpoint of the run can be exported.
+
+    Args:
+        run_folder: runs/<name>.
+        encoder: as built, trained or not.
+        bottleneck: as built, trained or not.
+        training: plain facts (objective, run); the steps are added at export.
+        data: plain facts (file, fingerprint).
+
+    Returns:
+        The file.
+
+    Raises:
+        UserError: it cannot be written, or holds what a bundle cannot.
+    """
+    path = Path(run_folder) / MODEL_DESCRIPTION
+    text = as_text(sealed(bundle_config(encoder, bottleneck, training, data)))
+    with whole_file(path) as temporary:
+        temporary.write_text(text)
+    return path
+
+
+def export_run(
+    run_folder: str | Path,
+    output: str | Path | None = None,
+    overwrite: bool = False,
+    formats: Sequence[str] = ("safetensors",),
+) -> Path:
+    """Export the newest good checkpoint of a run as a bundle.
+
+    Args:
+        run_folder: runs/<name>, as ``fit`` leaves it.
+        output: the bundle's folder; ``<run_folder>/bundle`` by default.
+        overwrite: replace an existing bundle.
+        formats: ``safetensors`` and optionally ``pt2``, ``onnx``.
+
+    Returns:
+        The bundle's folder.
+
+    Raises:
+        UserError: no such run, no checkpoint or none that is undamaged, weights that do not fit the description, or as
+            :func:`~repdib_lightning.export.bundle.save_bundle`.
+    """
+    run = Path(run_folder)
+    if not run.is_dir():
+        raise UserError(f"{run}: no such run folder")
+    path = run / MODEL_DESCRIPTION
+    if not path.is_file():
+        raise UserError(f"{run}: holds no {MODEL_DESCRIPTION}, so it is no run folder or its fit never began")
+    config = read_description(path)
+    encoder, bottleneck = rebuild(path, config)
+    # Only here: load_encoder shares this package and must not wait for what training imports.
+    from repdib_lightning.callbacks.checkpoint_files import last_good
+
+    checkpoint_file = last_good(run)
+    checkpoint = torch.load(checkpoint_file, map_location="cpu", weights_only=True)
+    fill(checkpoint_file, nn.ModuleDict({"encoder": encoder, "bottleneck": bottleneck}), _parts(checkpoint), path.name)
+    training = {"run": run.resolve().name, **config["training"], "steps": int(checkpoint["global_step"])}
+    folder = run / "bundle" if output is None else Path(output)
+    return save_bundle(
+        folder,
+        encoder.eval(),
+        bottleneck.eval(),
+        training=training,
+        data=config["data"],
+        overwrite=overwrite,
+        formats=formats,
+    )
+
+
+def _parts(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The weights of encoder and bottleneck; the objective's and the optimiser's stay behind."""
+    prefixes = ("encoder.", "bottleneck.")
+    return {name: value for name, value in checkpoint["state_dict"].items() if name.startswith(prefixes)}
