@@ -1,0 +1,66 @@
+"""Training curves from the CSV file that a run logs."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from repdib_lightning.errors import UserError
+from repdib_lightning.evaluation.figures import COLOURS, plain_axes, png
+
+WORTH_SHOWING = ("loss", "accuracy", "perplexity")
+MOST_PANELS = 6
+
+
+def read_curves(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a metrics.csv with a ``step`` column: name -> (n, 2) of (step, value), empty cells left out.
+
+    Raises:
+        UserError: no such file, or no ``step`` column.
+    """
+    try:
+        with open(path, newline="") as file:
+            lines = list(csv.DictReader(file))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from error
+    if lines and "step" not in lines[0]:
+        raise UserError(f"{path}: has no column 'step' (columns: {', '.join(map(str, lines[0]))})")
+    curves: dict[str, list[tuple[float, float]]] = {}
+    for line in lines:
+        for name, cell in line.items():
+            if name not in ("step", "epoch") and cell and line["step"]:
+                curves.setdefault(name, []).append((float(line["step"]), float(cell)))
+    return {name: np.array(points) for name, points in curves.items()}
+
+
+def training_curves(files: Mapping[str, Path]) -> bytes | None:
+    """Losses, accuracies and perplexities against the step, the runs in one panel each; None if nothing was logged.
+
+    Shown are the names that most runs share, at most six.
+    """
+    runs = {run: read_curves(path) for run, path in files.items()}
+    names = {name for curves in runs.values() for name in curves if any(word in name for word in WORTH_SHOWING)}
+    if not names:
+        return None
+    ranked = sorted(names, key=lambda name: (-sum(name in curves for curves in runs.values()), len(name), name))
+    shown = ranked[:MOST_PANELS]
+    columns = min(3, len(shown))
+    lines = -(-len(shown) // columns)
+    figure = Figure(figsize=(3.6 * columns, 2.5 * lines + 0.5), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for panel in panels[len(shown) :]:
+        panel.set_visible(False)
+    for panel, name in zip(panels, shown, strict=False):
+        for i, (run, curves) in enumerate(runs.items()):
+            points = curves.get(name, np.empty((0, 2)))
+            panel.plot(*points.T, color=COLOURS[i % len(COLOURS)], label=run, linewidth=1.3)
+        panel.set_title(name, fontsize=10)
+        panel.set_xlabel("step", fontsize=9)
+        plain_axes(panel)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    return png(figure)

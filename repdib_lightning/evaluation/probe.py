@@ -1,0 +1,261 @@
+"""Measures what a frozen encoder kept of the state and of every noise source: ``probe BUNDLE DATA``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch
+from torch import nn
+from tqdm import tqdm
+
+from repdib_lightning.data.episodes import EpisodeStore
+from repdib_lightning.data.files import whole_file
+from repdib_lightning.data.schema import FactorSpec
+from repdib_lightning.errors import UserError
+from repdib_lightning.evaluation.codes import CodebookUse, FactorBits, codebook_use, factor_bits
+from repdib_lightning.evaluation.features import Encodes, check_compatible, encode_rows, resolve_device
+from repdib_lightning.evaluation.probes import (
+    PROBES,
+    Half,
+    ProbeScore,
+    Standardiser,
+    as_target,
+    chance,
+    check_probes,
+    measure,
+)
+from repdib_lightning.evaluation.splits import ProbeSplit, split_evaluation
+from repdib_lightning.evaluation.tables import report_table
+
+if TYPE_CHECKING:
+    from repdib_lightning.export import FrozenEncoder
+
+Kind = Literal["endogenous", "exogenous"]
+
+
+@dataclass(frozen=True)
+class FactorReport:
+    """What a representation kept of one factor.
+
+    Attributes:
+        kind: ``endogenous`` (state: should be kept) or ``exogenous`` (noise: should be dropped).
+        metric: ``accuracy`` or ``R2``.
+        chance: score of a predictor that ignores the representation.
+        probes: probe name -> score.
+        bits: information in each group's code; None where nothing is quantised.
+        unseen: share of scored rows whose class the fit half lacks.
+    """
+
+    kind: Kind
+    metric: Literal["accuracy", "R2"]
+    chance: float
+    probes: dict[str, ProbeScore]
+    bits: FactorBits | None
+    unseen: float
+
+    @property
+    def best_bits(self) -> float | None:
+        """Bits in the most informative group."""
+        return max(self.bits.bits) if self.bits else None
+
+
+@dataclass(frozen=True)
+class ProbeReport:
+    """Every factor of a data set, read from one frozen encoder.
+
+    Attributes:
+        name: of the bundle.
+        data, fingerprint: the store, by file name and hash of its content.
+        features: M. groups: G. seed: of the probes.
+        fit_episodes, score_episodes: which evaluation episodes each half holds.
+        fit_rows, score_rows: how many rows each half holds.
+        factors: name -> report, endogenous first.
+        codebook: use of codes on all evaluation rows; None where nothing is quantised.
+    """
+
+    name: str
+    data: str
+    fingerprint: str
+    features: int
+    groups: int
+    seed: int
+    fit_episodes: list[int]
+    score_episodes: list[int]
+    fit_rows: int
+    score_rows: int
+    factors: dict[str, FactorReport]
+    codebook: CodebookUse | None
+
+    def mean_kept(self, kind: Kind, probe: str) -> float | None:
+        """Mean *kept* over the factors of a kind; None if there is none, or none that varies."""
+        scores = [f.probes[probe].kept for f in self.factors.values() if f.kind == kind and probe in f.probes]
+        known = [kept for kept in scores if kept is not None]
+        return float(np.mean(known)) if known else None
+
+    @property
+    def probes(self) -> list[str]:
+        """Names of the probes that were fitted."""
+        return list(next(iter(self.factors.values())).probes)
+
+    def summary(self) -> dict[str, dict[str, float | None]]:
+        """Kind -> probe -> mean kept."""
+        kinds: tuple[Kind, Kind] = ("endogenous", "exogenous")
+        return {kind: {probe: self.mean_kept(kind, probe) for probe in self.probes} for kind in kinds}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionaries, lists, strings, numbers and None (JSON)."""
+        return {**asdict(self), "summary": self.summary()}
+
+    def write(self, path: Path) -> None:
+        """Write JSON; the file is whole or absent. Raises UserError if the folder cannot be written to."""
+        with whole_file(path) as aside:
+            aside.write_text(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
+
+    def table(self) -> str:
+        """The plain text table that the terminal shows."""
+        return report_table(self)
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """Evaluation rows of a store, seen through one frozen encoder, in the order of the store.
+
+    Attributes:
+        split: the two halves. latents: (n, M) float32. codes: (n, G) int64 or None. codes_per_group: L.
+    """
+
+    split: ProbeSplit
+    latents: np.ndarray
+    codes: np.ndarray | None
+    codes_per_group: int
+
+
+def probe_bundle(
+    bundle: Path,
+    data: Path,
+    *,
+    output: Path | None = None,
+    probes: tuple[str, ...] = PROBES,
+    device: str = "auto",
+    seed: int = 0,
+    progress: bool = True,
+) -> ProbeReport:
+    """Probe an exported encoder for every factor of a data set, and write the result as JSON.
+
+    Args:
+        bundle: folder of an exported encoder.
+        data: a store with factors and at least two evaluation episodes.
+        output: the JSON file; ``probe.json`` in the bundle by default.
+        probes: ``linear``, ``mlp`` or both.
+        device: runs the encoder; the probes run on the CPU.
+        seed: of the MLP and of the permutation null.
+        progress: show progress bars.
+
+    Raises:
+        UserError: bad bundle or data, observations that do not match, no factors, too few evaluation episodes.
+    """
+    check_probes(tuple(probes))
+    store = open_for_probing(data)
+    _, report, _ = probe_one(bundle, store, probes=tuple(probes), device=device, seed=seed, progress=progress)
+    report.write(Path(output) if output is not None else Path(bundle) / "probe.json")
+    return report
+
+
+def probe_one(
+    bundle: Path, store: EpisodeStore, *, probes: tuple[str, ...], device: str, seed: int, progress: bool
+) -> tuple[Encoded, ProbeReport, FrozenEncoder]:
+    """Load, encode and probe one bundle; nothing is written."""
+    from repdib_lightning.export import load_encoder
+
+    target = resolve_device(device)
+    encoder = load_encoder(bundle).to(target)
+    check_compatible(encoder, store, str(bundle))
+    encoded = encode_evaluation(encoder, store, device=target, progress=progress)
+    name = Path(bundle).resolve().name
+    report = probe_encoded(encoded, store, name=name, probes=probes, seed=seed, progress=progress)
+    return encoded, report, encoder
+
+
+def open_for_probing(data: Path) -> EpisodeStore:
+    """Open a store and check that it can be probed.
+
+    Raises:
+        UserError: it cannot be read, has no factors, or has NaN in one.
+    """
+    store = EpisodeStore(data)
+    if not store.factors:
+        raise UserError(f"{data}: has no 'factors' to probe for (keys: observations, ...); nothing to measure")
+    for name, spec in store.factors.items():
+        values = np.asarray(store.array(f"factors/{name}")[:])
+        bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(1))
+        if len(bad):
+            raise UserError(f"{data}: 'factors/{name}' is NaN or infinite at row {bad[0]}; {len(bad)} such rows")
+        if spec.scale == "categorical" and values.min() < 0:
+            raise UserError(f"{data}: 'factors/{name}' has a negative class {values.min()} at row {values.argmin()}")
+    return store
+
+
+def encode_evaluation(
+    encoder: Encodes, store: EpisodeStore, *, device: str | torch.device = "cpu", progress: bool = True
+) -> Encoded:
+    """Encode all evaluation rows of a store once."""
+    assert not (isinstance(encoder, nn.Module) and encoder.training), "probes take a frozen encoder in eval mode"
+    split = split_evaluation(store)
+    latents, codes = encode_rows(encoder, store, split.rows, device=device, progress=progress)
+    return Encoded(split, latents, codes, encoder.codes_per_group)
+
+
+def probe_encoded(
+    encoded: Encoded,
+    store: EpisodeStore,
+    *,
+    name: str,
+    probes: tuple[str, ...] = PROBES,
+    seed: int = 0,
+    progress: bool = True,
+) -> ProbeReport:
+    """Probe latents for every factor of their store, the state's factors first."""
+    split = encoded.split
+    rows, episodes = split.rows, store.row_episodes[split.rows]
+    in_fit = np.isin(episodes, split.fit)
+    features = Standardiser(encoded.latents[in_fit])(encoded.latents)
+    reports = {}
+    ordered = sorted(store.factors.items(), key=lambda item: (item[1].kind, item[0]))
+    for factor, spec in tqdm(ordered, desc="probe", unit="factor", disable=not progress, leave=False):
+        target = as_target(store.gather(f"factors/{factor}", rows), spec)
+        fit = Half(features[in_fit], target[in_fit], episodes[in_fit])
+        score = Half(features[~in_fit], target[~in_fit], episodes[~in_fit])
+        bits = None if encoded.codes is None else factor_bits(encoded.codes, target, seed)
+        reports[factor] = _factor_report(spec, fit, score, probes, bits, seed)
+    return ProbeReport(
+        name=name,
+        data=store.path.name,
+        fingerprint=store.fingerprint,
+        features=encoded.latents.shape[1],
+        groups=0 if encoded.codes is None else encoded.codes.shape[1],
+        seed=seed,
+        fit_episodes=split.fit.tolist(),
+        score_episodes=split.score.tolist(),
+        fit_rows=len(split.fit_rows),
+        score_rows=len(split.score_rows),
+        factors=reports,
+        codebook=None if encoded.codes is None else codebook_use(encoded.codes, encoded.codes_per_group),
+    )
+
+
+def _factor_report(
+    spec: FactorSpec, fit: Half, score: Half, probes: tuple[str, ...], bits: FactorBits | None, seed: int
+) -> FactorReport:
+    categorical = spec.scale == "categorical"
+    return FactorReport(
+        kind=spec.kind,
+        metric="accuracy" if categorical else "R2",
+        chance=chance(fit, score),
+        probes={probe: measure(probe, fit, score, seed) for probe in probes},
+        bits=bits,
+        unseen=float(np.mean(~np.isin(score.target, fit.target))) if categorical else 0.0,
+    )

@@ -1,0 +1,221 @@
+"""Compares frozen encoders on one data set: a table for the terminal, and one self-contained HTML page."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from repdib_lightning.data.episodes import EpisodeStore
+from repdib_lightning.data.files import whole_file
+from repdib_lightning.errors import UserError
+from repdib_lightning.evaluation import curves, figures
+from repdib_lightning.evaluation.probe import Encoded, ProbeReport, open_for_probing, probe_one
+from repdib_lightning.evaluation.probes import PROBES, check_probes
+from repdib_lightning.evaluation.tables import comparison_table, notes
+
+SCATTERED = 2000
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd; }
+img { max-width: 100%; } .wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
+th, td { padding: .25rem .7rem; text-align: right; } th:first-child, td:first-child { text-align: left; }
+thead th, tr.rule td { border-top: 1px solid #888; } thead th { border-bottom: 1px solid #888; }
+pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: .85rem; }
+.note { color: #555; font-size: .9rem; }
+"""
+
+
+@dataclass(frozen=True)
+class Section:
+    """One heading of the page with its HTML body."""
+
+    title: str
+    body: str
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """One frozen encoder, probed.
+
+    Attributes:
+        report: what it kept. encoded: its evaluation latents, or None to leave out the scatter.
+        description: plain facts of encoder, bottleneck and training (the bundle's ``config.json``).
+        metrics: the run's ``metrics.csv``, or None. bundle: the folder to load it from.
+    """
+
+    report: ProbeReport
+    encoded: Encoded | None = None
+    description: Mapping[str, Any] | None = None
+    metrics: Path | None = None
+    bundle: Path | None = None
+
+
+def compare(
+    bundles: Mapping[str, Path],
+    data: Path,
+    output: Path,
+    *,
+    metrics: Mapping[str, Path] | None = None,
+    title: str = "What the representation kept and dropped",
+    probes: tuple[str, ...] = PROBES,
+    device: str = "auto",
+    seed: int = 0,
+    progress: bool = True,
+) -> str:
+    """Probe several bundles on one data set, write the HTML page, and return the table for the terminal.
+
+    Args:
+        bundles: run name -> folder of an exported encoder; ratios are relative to the first.
+        data: a store with factors and at least two evaluation episodes.
+        output: the HTML file. A ``.json`` beside it holds every report in full.
+        metrics: run name -> metrics.csv, for the training curves.
+        title, probes, device, seed, progress: as in :func:`repdib_lightning.evaluation.probe.probe_bundle`.
+
+    Raises:
+        UserError: as ``probe_bundle`` does; nothing is written then.
+    """
+    if not bundles:
+        raise UserError("compare: at least one bundle is needed")
+    check_probes(tuple(probes))
+    store = open_for_probing(data)
+    runs = {}
+    for name, bundle in bundles.items():
+        encoded, report, frozen = probe_one(
+            Path(bundle), store, probes=tuple(probes), device=device, seed=seed, progress=progress
+        )
+        description = getattr(frozen, "description", None)
+        runs[name] = RunResult(report, encoded, description, (metrics or {}).get(name), Path(bundle))
+    write_comparison(output, runs, store, title=title)
+    reports = {name: run.report for name, run in runs.items()}
+    return "\n".join([comparison_table(reports).text(), "", *notes(reports)])
+
+
+def write_comparison(output: Path, runs: Mapping[str, RunResult], store: EpisodeStore, *, title: str) -> None:
+    """Write the page of several probed runs, and the figures behind it as JSON beside it (same name, ``.json``)."""
+    output = Path(output)
+    reports = {name: run.report for name, run in runs.items()}
+    plain = json.dumps({name: report.to_dict() for name, report in reports.items()}, indent=2, allow_nan=False)
+    page = render_page(title, comparison_sections(runs, store))
+    with whole_file(output.with_suffix(".json")) as aside:
+        aside.write_text(plain + "\n")
+    with whole_file(output) as aside:
+        aside.write_text(page, encoding="utf-8")
+
+
+def write_report(path: Path, title: str, sections: list[Section]) -> None:
+    """Write one self-contained HTML page: no scripts, no external resources; whole or absent.
+
+    Raises:
+        UserError: the folder cannot be written to, or the disk is full.
+    """
+    with whole_file(Path(path)) as aside:
+        aside.write_text(render_page(title, sections), encoding="utf-8")
+
+
+def render_page(title: str, sections: list[Section]) -> str:
+    """The page's HTML; the same input gives the same text."""
+    body = "\n".join(f"<h2>{html.escape(section.title)}</h2>\n{section.body}" for section in sections)
+    heading = html.escape(title)
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{heading}</title>\n'
+        f"<style>{STYLE}</style>\n</head>\n<body>\n<h1>{heading}</h1>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def picture(content: bytes, description: str) -> str:
+    """An inline PNG with a description for readers who cannot see it."""
+    data = base64.b64encode(content).decode()
+    return f'<p><img alt="{html.escape(description, quote=True)}" src="data:image/png;base64,{data}"></p>'
+
+
+def comparison_sections(runs: Mapping[str, RunResult], store: EpisodeStore) -> list[Section]:
+    """The sections of the page, in reading order; what has nothing to show is left out."""
+    reports = {name: run.report for name, run in runs.items()}
+    sections = [
+        Section("What was kept and dropped", _table_body(reports)),
+        Section("Kept of each factor", picture(figures.kept_bars(reports), "bars of kept, state apart from noise")),
+        Section("What was trained", _trained_body(runs)),
+    ]
+    strip = figures.frame_strip(store, _evaluation_rows(store), list(store.observations))
+    drawn = {
+        "What the encoder sees": strip,
+        "Bits in each group of codes": figures.bits_map(reports),
+        "Use of the codebooks": figures.codebook_bars(reports),
+        "The latents in two dimensions (PCA)": _scatter(runs, store),
+        "Training": _curves(runs),
+    }
+    sections += [Section(name, picture(content, name)) for name, content in drawn.items() if content is not None]
+    return [*sections, Section("Use the encoder", _usage_body(runs))]
+
+
+def _table_body(reports: dict[str, ProbeReport]) -> str:
+    lines = "<br>".join(html.escape(line) for line in notes(reports))
+    return f'<div class="wide">{comparison_table(reports).html()}</div>\n<p class="note">{lines}</p>'
+
+
+def _trained_body(runs: Mapping[str, RunResult]) -> str:
+    first = next(iter(runs.values())).report
+    parts = [f"<p>{len(runs)} encoder(s), frozen and probed on {html.escape(first.data)}.</p>"]
+    for name, run in runs.items():
+        parts.append(f"<h3>{html.escape(name)}</h3>")
+        facts: dict[str, Any] = {"features": run.report.features, "groups": run.report.groups}
+        if run.report.codebook is not None:
+            facts["codes_per_group"] = run.report.codebook.codes_per_group
+        wanted = ("encoder", "bottleneck", "training", "data")
+        facts |= {key: value for key, value in (run.description or {}).items() if key in wanted}
+        shown = json.dumps(facts, indent=2, default=str)
+        parts.append(f"<pre>{html.escape(shown)}</pre>")
+    return "\n".join(parts)
+
+
+def _usage_body(runs: Mapping[str, RunResult]) -> str:
+    name, run = list(runs.items())[-1]
+    bundle = str(run.bundle) if run.bundle is not None else name
+    quantised = run.report.codebook is not None
+    lines = [
+        "from repdib_lightning.export import load_encoder",
+        "",
+        f"encoder = load_encoder({bundle!r})   # frozen, evaluation mode, no training code",
+        f"latent = encoder.encode(observations)   # {{name: uint8 (N, C, H, W)}} -> float32 (N, {run.report.features})",
+    ]
+    if quantised:
+        lines.append(f"codes = encoder.codes(observations)     # int64 (N, {run.report.groups})")
+    return f"<pre>{html.escape(chr(10).join(lines))}</pre>"
+
+
+def _evaluation_rows(store: EpisodeStore) -> np.ndarray:
+    return np.flatnonzero(np.isin(store.row_episodes, store.episodes("evaluation")))
+
+
+def _curves(runs: Mapping[str, RunResult]) -> bytes | None:
+    files = {name: run.metrics for name, run in runs.items() if run.metrics is not None}
+    return curves.training_curves(files) if files else None
+
+
+def _scatter(runs: Mapping[str, RunResult], store: EpisodeStore) -> bytes | None:
+    """Latents coloured by the first state factor and by the noise factor that the first run kept most of."""
+    encoded = {name: run.encoded for name, run in runs.items() if run.encoded is not None}
+    if not encoded:
+        return None
+    rows = next(iter(encoded.values())).split.rows
+    thin = np.unique(np.linspace(0, len(rows) - 1, min(SCATTERED, len(rows))).astype(int))
+    report = next(iter(runs.values())).report
+    chosen = [name for name, factor in report.factors.items() if factor.kind == "endogenous"][:1]
+    noise = [name for name, factor in report.factors.items() if factor.kind == "exogenous"]
+    probe = report.probes[0]
+    noise.sort(key=lambda name: -(report.factors[name].probes[probe].kept or 0.0))
+    chosen += noise[: 2 - len(chosen)]
+    colourings = {}
+    for name in chosen:
+        values = store.gather(f"factors/{name}", rows[thin])
+        flat = values if values.ndim == 1 else values[:, 0]
+        colourings[name] = (np.asarray(flat), report.factors[name].kind)
+    return figures.latent_scatter({name: part.latents[thin] for name, part in encoded.items()}, colourings)
