@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+COLLECTORS = {"robot_arm": "repdib_lightning.environments.collect:collect_robot_arm"}
+"""Environment -> ``module:function`` that records a data set of it: ``function(path, *, seed, overwrite, ...)``."""
+
 GYMNASIUM_IDS = {"repdib/RobotArm-v0": "repdib_lightning.environments.robot_arm_env:RobotArmEnv"}
 """Identifier for ``gymnasium.make`` -> class; see :func:`register`."""
 

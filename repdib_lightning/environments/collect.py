@@ -15,15 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from repdib_lightning.data.writer import EpisodeWriter
+from repdib_lightning.environments import COLLECTORS as COLLECTORS
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import ActionSpec, ArraySpec
 
 if TYPE_CHECKING:
     from repdib_lightning.environments.robot_arm import Television
     from repdib_lightning.environments.robot_arm_scene import RobotArmScene
-
-COLLECTORS = {"robot_arm": "repdib_lightning.environments.collect:collect_robot_arm"}
-"""Environment -> ``module:function`` that records a data set of it: ``function(path, *, seed, overwrite, ...)``."""
 
 EVALUATION_SHARE = 0.3
 _CAMERAS = ("front", "top")
