@@ -15,9 +15,10 @@ Axes, used in every docstring:
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from torch import Tensor
+if TYPE_CHECKING:  # collecting and reading data must not pay for importing torch
+    from torch import Tensor
 
 Split = Literal["train", "evaluation"]
 

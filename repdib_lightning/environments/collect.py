@@ -181,7 +181,7 @@ def _serve(connection: Connection, recording: RobotArmRecording) -> None:
         television = Television(recording.distractors, recording.seed)
         while (episode := connection.recv()) is not None:
             connection.send((episode, record_episode(recording, episode, scene, television)))
-    except EOFError:
+    except (EOFError, BrokenPipeError):
         return  # the parent is gone
     except Exception as error:
         connection.send((-1, UserError(str(error)) if isinstance(error, UserError) else RuntimeError(repr(error))))

@@ -7,7 +7,7 @@ Everything is a *clip*: a few frames in order, or a single still. A source is na
 - ``procedural_images``: stills with natural-image spectra; needs no file.
 - a folder: each picture in it is a still, each sub-folder of pictures is one clip (frames in the order of their
   names), each video file is one clip.
-- a video-less folder that is, or holds, torchvision's ``cifar-10-batches-py``: stills, training and evaluation from
+- a folder that is, or holds, torchvision's ``cifar-10-batches-py``: stills, training and evaluation from
   CIFAR-10's own split.
 
 Training and evaluation never share a clip; which is which depends on (source, seed) alone.
@@ -31,7 +31,10 @@ CIFAR_FOLDER = "cifar-10-batches-py"
 EVALUATION_SHARE = 0.25
 """Share of a folder's clips that is kept for evaluation."""
 
-_CACHED_CLIPS = 32
+MOST_FRAMES = 300
+"""Frames read from a video file or a folder of frames; the rest of a long video is not played."""
+
+_CACHED_BYTES = 2**28
 _SPLITS: dict[Split, int] = {"train": 0, "evaluation": 1}
 
 
@@ -81,7 +84,7 @@ class Distractors:
             size: height and width in pixels, or one number for both. Pictures are cropped at the centre to the wanted
                 proportions, then scaled.
             limit: how many clips to use at most; None for all.
-            frames: length of procedural clips, and the most frames read from a video file or folder.
+            frames: length of procedural clips.
 
         Raises:
             UserError: unknown source, missing or empty folder, too few clips for two splits, unreadable CIFAR-10.
@@ -97,7 +100,7 @@ class Distractors:
         return len(self.keys)
 
     def clip(self, index: int) -> np.ndarray:
-        """(T, H, W, 3) uint8: one clip; T is 1 for a still. The last few are kept in memory.
+        """(T, H, W, 3) uint8: one clip; T is 1 for a still. The latest ones are kept in memory.
 
         Raises:
             UserError: the clip's file cannot be read.
@@ -106,7 +109,7 @@ class Distractors:
             clip = self._source.load(self.keys[index], self._height, self._width)
             assert clip.dtype == np.uint8 and clip.shape[1:] == (self._height, self._width, 3)
             self._cache[index] = clip
-            if len(self._cache) > _CACHED_CLIPS:
+            while len(self._cache) > 1 and sum(c.nbytes for c in self._cache.values()) > _CACHED_BYTES:
                 self._cache.popitem(last=False)
         self._cache.move_to_end(index)
         return self._cache[index]
@@ -124,7 +127,7 @@ def _open_source(source: str, seed: int, frames: int) -> _Source:
     for root in (folder, folder.parent):
         if (root / CIFAR_FOLDER).is_dir() and (root == folder or folder.name == CIFAR_FOLDER):
             return Cifar10(root)
-    return Folder(folder, seed, frames)
+    return Folder(folder, seed)
 
 
 def _rng(seed: int, split: int, index: int) -> np.random.Generator:
@@ -254,8 +257,7 @@ class Cifar10:
 class Folder:
     """A folder of pictures, of folders of pictures, and of video files."""
 
-    def __init__(self, folder: Path, seed: int, frames: int) -> None:
-        self._frames = frames
+    def __init__(self, folder: Path, seed: int) -> None:
         self._clips = _find_clips(folder)
         if len(self._clips) < 2:
             kinds = ", ".join(sorted(PICTURES | VIDEOS))
@@ -272,13 +274,13 @@ class Folder:
         return [self._clips[i] for i in np.sort(order)]
 
     def load(self, key: Path, height: int, width: int) -> np.ndarray:
-        """(T, H, W, 3) uint8; long videos are cut after the wanted number of frames."""
+        """(T, H, W, 3) uint8; long ones are cut after ``MOST_FRAMES``."""
         if key.is_dir():
-            paths = sorted(p for p in key.iterdir() if p.suffix.lower() in PICTURES)[: self._frames]
+            paths = sorted(p for p in key.iterdir() if p.suffix.lower() in PICTURES)[:MOST_FRAMES]
             return np.stack([_read_picture(path, height, width) for path in paths])
         if key.suffix.lower() in PICTURES:
             return _read_picture(key, height, width)[None]
-        return _read_video(key, height, width, self._frames)
+        return _read_video(key, height, width)
 
 
 def _find_clips(folder: Path) -> list[Path]:
@@ -299,7 +301,7 @@ def _read_picture(path: Path, height: int, width: int) -> np.ndarray:
         raise UserError(f"{path}: not a readable picture ({str(error).splitlines()[0]})") from error
 
 
-def _read_video(path: Path, height: int, width: int, limit: int) -> np.ndarray:
+def _read_video(path: Path, height: int, width: int) -> np.ndarray:
     import av
 
     frames: list[np.ndarray] = []
@@ -307,7 +309,7 @@ def _read_video(path: Path, height: int, width: int, limit: int) -> np.ndarray:
         with av.open(str(path)) as container:
             for frame in container.decode(video=0):
                 frames.append(_fitted(frame.to_image(), height, width))
-                if len(frames) == limit:
+                if len(frames) == MOST_FRAMES:
                     break
     except (OSError, ValueError, IndexError) as error:  # av's own errors derive from these
         raise UserError(f"{path}: not a readable video ({str(error).splitlines()[0]})") from error

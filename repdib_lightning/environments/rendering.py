@@ -10,6 +10,7 @@ import atexit
 import importlib
 import os
 import weakref
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -43,12 +44,23 @@ def prepare_rendering(*, threads: int | None = None) -> Any:
     backend = _backend()
     if threads is not None:
         os.environ.setdefault("LP_NUM_THREADS", str(threads))
+    _import_triton_first()
     try:
         mujoco = importlib.import_module("mujoco")
     except (ImportError, AttributeError) as error:
         raise _no_renderer(backend, error) from error
     _check_version(mujoco.__version__)
     return mujoco
+
+
+def _import_triton_first() -> None:
+    """Load triton, where it is installed, before any OpenGL driver.
+
+    Mesa's software driver brings its own LLVM. When that is loaded first, triton's binds to it and importing triton
+    (torch.compile, torchvision's models) ends the process with a segmentation fault; the other order works.
+    """
+    with suppress(ImportError):
+        importlib.import_module("triton")
 
 
 def _backend() -> str:

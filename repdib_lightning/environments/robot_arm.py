@@ -119,7 +119,8 @@ class Noise:
 
     def factors(self, television: Television) -> dict[str, np.ndarray]:
         """Name -> (T, ...) of every exogenous factor."""
-        lengths = np.array([len(television.clip(int(v))) for v in self.video])
+        shown, where = np.unique(self.video, return_inverse=True)
+        lengths = np.array([len(television.clip(int(number))) for number in shown])[where]
         return {
             "time_step": self.time_step.astype(np.float32),
             "video": self.video.astype(np.int64),
