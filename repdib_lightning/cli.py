@@ -12,25 +12,32 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
+from jsonargparse.typing import PositiveInt
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from repdib_lightning import configurations, run_folder
 from repdib_lightning.bottlenecks import BOTTLENECKS
-from repdib_lightning.callbacks import CHECKPOINTS, AtomicCheckpointIO, last_good, run_callbacks
+from repdib_lightning.callbacks import exit_codes, last_good, run_callbacks, run_plugins
+from repdib_lightning.callbacks.checkpoint_files import step_of
+from repdib_lightning.callbacks.codebook_use import CodebookUse
+from repdib_lightning.callbacks.metrics_csv import MetricsCSV
+from repdib_lightning.callbacks.pictures import Pictures
 from repdib_lightning.data.datamodule import EpisodeDataModule
 from repdib_lightning.data.robot_arm import RobotArmDataModule
 from repdib_lightning.encoders import ENCODERS
 from repdib_lightning.errors import UserError
+from repdib_lightning.export.run_export import write_model_description
 from repdib_lightning.objectives import OBJECTIVES
 from repdib_lightning.option_errors import one_line
 from repdib_lightning.representation import RepresentationModule
 
 DEFAULT = "robot_arm"
-SLOTS = {
-    "model.encoder": ENCODERS,
-    "model.bottleneck": BOTTLENECKS,
-    "model.objective": OBJECTIVES,
+SLOTS: dict[str, list[str]] = {
+    "model.encoder": list(ENCODERS),
+    "model.bottleneck": list(BOTTLENECKS),
+    "model.objective": list(OBJECTIVES),
     "model.optimizer": [name for name, item in vars(torch.optim).items() if isinstance(item, type)],
     "data": [EpisodeDataModule.__name__, RobotArmDataModule.__name__],
 }
@@ -51,6 +58,8 @@ class TrainingCLI(LightningCLI):
         parser.add_argument(
             "--resume", type=str | None, default=None, help="Folder of a run to go on with, exactly where it stopped."
         )
+        parser.add_argument("--checkpoint_every", type=PositiveInt, default=100, help="Steps between checkpoints.")
+        parser.add_argument("--checkpoint_keep", type=PositiveInt, default=3, help="Checkpoints to keep, newest first.")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Parse; bad input becomes one line."""
@@ -64,16 +73,18 @@ class TrainingCLI(LightningCLI):
 
     def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
         """Give the trainer the loggers, callbacks and plugins of the run's folder."""
-        resumed = self.config.resume is not None
-        self.folder = Path(self.config.resume or self.config.run or run_folder.default_folder(self._file_names()))
-        place = {"save_dir": str(self.folder.parent), "name": self.folder.name, "version": ""}
-        kwargs |= {"logger": [TensorBoardLogger(**place), CSVLogger(**place)], "default_root_dir": str(self.folder)}
-        kwargs["plugins"] = [*(self.config_init.trainer.plugins or []), AtomicCheckpointIO()]
-        folder = run_folder.RunFolder(self.folder, self._configuration(), resumed=resumed)
-        self.trainer_defaults = {"callbacks": [folder, *run_callbacks(self.folder)]}
+        config = self.config
+        self.folder = Path(config.resume or config.run or run_folder.default_folder(self._file_names()))
+        self.checkpoint = last_good(self.folder) if config.resume else None
+        step = step_of(self.checkpoint) if self.checkpoint else None
+        board = TensorBoardLogger(self.folder.parent, name=self.folder.name, version="", purge_step=step)
+        kwargs |= {"logger": [board, MetricsCSV(self.folder, step)], "default_root_dir": str(self.folder)}
+        kwargs["plugins"] = [*(self.config_init.trainer.plugins or []), *run_plugins()]
+        safety = run_callbacks(self.folder, config.checkpoint_every, config.checkpoint_keep)
+        self.trainer_defaults = {"callbacks": [Pictures(), CodebookUse(), *safety]}
         return super().instantiate_trainer(**kwargs)
 
-    def _configuration(self) -> str:
+    def configuration(self) -> str:
         """The whole configuration as YAML, without what names files and folders of this call."""
         kept = self.config.clone()
         for key in ("config", "run", "resume"):
@@ -87,17 +98,28 @@ class TrainingCLI(LightningCLI):
 def fit(arguments: list[str]) -> int:
     """Train a new run, or go on with one."""
     cli = _prepare(_with_run("--resume", arguments))
-    resumed = cli.config.resume is not None
-    if not resumed:
-        run_folder.check_new(cli.folder)
-    checkpoint = last_good(cli.folder / CHECKPOINTS) if resumed else None
+    resumed = cli.checkpoint is not None
+    run_folder.check_new(cli.folder, exist_ok=resumed)
     cli.datamodule.prepare_data()
     cli.datamodule.setup("fit")
-    cli.model.build(cli.datamodule.spec)
+    cli.model.build(cli.datamodule.spec).rehearse(cli.datamodule.example())
+    run_folder.open_run(cli.folder, cli.configuration(), cli.datamodule.store, resumed=resumed)
+    if not resumed:
+        _describe_model(cli)
     print(f"run folder: {cli.folder}", flush=True)
-    cli.trainer.fit(cli.model, datamodule=cli.datamodule, ckpt_path=checkpoint)
+    with exit_codes():
+        cli.trainer.fit(cli.model, datamodule=cli.datamodule, ckpt_path=cli.checkpoint)
     print(f"finished: {cli.folder}    next: python -m repdib_lightning export {cli.folder}", flush=True)
     return 0
+
+
+@rank_zero_only
+def _describe_model(cli: TrainingCLI) -> None:
+    """Write into the run's folder what ``export`` needs to build encoder and bottleneck again."""
+    store = cli.datamodule.store
+    training = {"objective": type(cli.model.objective).__name__, "run": cli.folder.name}
+    data = {"file": store.path.name, "fingerprint": store.fingerprint}
+    write_model_description(cli.folder, cli.model.encoder, cli.model.bottleneck, training=training, data=data)
 
 
 def validate(arguments: list[str]) -> int:
@@ -116,18 +138,23 @@ def _evaluate(verb: str, arguments: list[str]) -> int:
     elif not {"-h", "--help"} & set(arguments):
         raise UserError(f"{verb}: needs the folder of a run: python -m repdib_lightning {verb} runs/NAME")
     cli = _prepare(_with_run("--resume", arguments))
-    checkpoint = last_good(cli.folder / CHECKPOINTS)
     cli.datamodule.setup(verb)
     cli.model.build(cli.datamodule.spec)
-    trainer = pl.Trainer(logger=False, enable_checkpointing=False, enable_model_summary=False, plugins=AtomicCheckpointIO())
-    getattr(trainer, verb)(cli.model, datamodule=cli.datamodule, ckpt_path=checkpoint)
+    trainer = pl.Trainer(logger=False, enable_checkpointing=False, enable_model_summary=False, plugins=run_plugins())
+    getattr(trainer, verb)(cli.model, datamodule=cli.datamodule, ckpt_path=cli.checkpoint)
     return 0
 
 
 def _prepare(arguments: list[str]) -> TrainingCLI:
     """Parse and build everything; nothing is written."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    for chatty in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+    for harmless in (
+        ".*does not have many workers.*",
+        ".*LightningCLI's args parameter.*",
+        ".*exists and is not empty.*",
+    ):
+        warnings.filterwarnings("ignore", message=harmless)
     expanded = configurations.expand(arguments)
     if not any(argument.startswith("--config") for argument in expanded):
         expanded = ["--config", str(configurations.resolve(DEFAULT)), *expanded]
@@ -165,4 +192,4 @@ def _one_line_errors(parser: LightningArgumentParser) -> Iterator[None]:
         raise
     except (argparse.ArgumentError, ValueError, TypeError, ImportError, AttributeError) as error:
         options = [option[2:] for action in parser._actions for option in action.option_strings if option[:2] == "--"]
-        raise one_line(error, options, {slot: sorted(known) for slot, known in SLOTS.items()}) from error
+        raise one_line(error, options, SLOTS) from error

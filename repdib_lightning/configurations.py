@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import yaml
+
 from repdib_lightning.errors import UserError, nearest
 
 
@@ -23,12 +25,21 @@ def resolve(name: str) -> Path:
     """
     path = Path(name)
     if path.is_file():
-        return path
+        return _readable(path)
     known = packaged()
     short = name.removesuffix(".yaml").removeprefix("conf/")
     if short not in known:
         raise UserError(f"--config {name}: no such file or packaged configuration; {nearest(short, known)}")
     return known[short]
+
+
+def _readable(path: Path) -> Path:
+    try:
+        yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise UserError(f"{path}: not valid YAML ({reason})") from error
+    return path
 
 
 def expand(arguments: list[str]) -> list[str]:

@@ -66,7 +66,7 @@ class RepresentationModule(pl.LightningModule):
         """Build encoder, bottleneck and objective from the data module's spec (once)."""
         if hasattr(self, "encoder"):
             return
-        self.build(self.trainer.datamodule.spec)
+        self.build(self.trainer.datamodule.spec)  # type: ignore[attr-defined]
 
     def build(self, spec: DataSpec) -> RepresentationModule:
         """Build the parts for data of this spec; for use without a trainer."""
@@ -74,6 +74,24 @@ class RepresentationModule(pl.LightningModule):
         self.bottleneck = self.build_bottleneck(self.encoder.features)
         self.objective = self.build_objective(self.encoder.features, spec)
         return self
+
+    @torch.no_grad()
+    def rehearse(self, batch: Batch) -> None:
+        """Pass one batch through everything without training, so that what does not fit shows before a run begins.
+
+        Raises:
+            UserError: loss weights for terms that this run does not have, or what a part complains of.
+        """
+        training = self.training
+        with torch.random.fork_rng():
+            self.eval()
+            output = self._evaluate(batch)
+        self.train(training)
+        for name in self.named_weights:
+            if name not in output.losses:
+                raise UserError(
+                    f"model.loss_weights: no loss is called '{name}' in this run {nearest(name, output.losses)}"
+                )
 
     def configure_optimizers(self) -> Any:
         """One optimiser over all parameters."""
@@ -121,26 +139,18 @@ class RepresentationModule(pl.LightningModule):
         for output in bottlenecks:
             objective.losses |= output.losses
             objective.metrics |= output.metrics
-        self._check_names(objective.losses)
         return objective
 
     def _augment(self, observation: Tensor) -> Tensor:
         picture = observation.dtype == torch.uint8 and observation.ndim == 4
         return random_shift(observation, self.shift) if self.training and picture else observation
 
-    def _check_names(self, losses: dict[str, Tensor]) -> None:
-        for name in self.named_weights:
-            if name not in losses:
-                raise UserError(f"model.loss_weights: no loss is called '{name}' in this run {nearest(name, losses)}")
-
     def _weight(self, name: str) -> float:
         steps = self.warmup.get(name, 0)
         share = min(1.0, (self.global_step + 1) / steps) if steps else 1.0
         return self.loss_weights.get(name, 1.0) * share
 
-    def _log(
-        self, stage: str, batch: Batch, loss: Tensor, output: ObjectiveOutput, terms: dict[str, Tensor]
-    ) -> None:
+    def _log(self, stage: str, batch: Batch, loss: Tensor, output: ObjectiveOutput, terms: dict[str, Tensor]) -> None:
         values = {f"{stage}/loss": loss.detach()}
         values |= {f"{stage}/raw/{name}": value.detach() for name, value in output.losses.items()}
         values |= {f"{stage}/weighted/{name}": value.detach() for name, value in terms.items()}

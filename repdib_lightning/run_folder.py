@@ -9,9 +9,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import lightning.pytorch as pl
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
+from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.errors import UserError, nearest
 
@@ -19,30 +19,22 @@ CONFIGURATION = "config.yaml"
 _VERSIONED = ("repdib_lightning", "torch", "torchvision", "lightning", "numpy", "h5py", "mujoco", "dm_control")
 
 
-class RunFolder(Callback):
-    """Makes the run's folder when training really starts: after the data, the model and the options are found good.
+@rank_zero_only
+def open_run(folder: Path, configuration: str, store: EpisodeStore, *, resumed: bool) -> None:
+    """Make the run's folder (or go on in it) and write config.yaml and environment.json.
 
-    Args:
-        folder: runs/<name>.
-        configuration: the whole configuration as YAML.
-        resumed: the folder exists and goes on.
+    Called when the options, the data and the model are known to be good, just before training.
+
+    Raises:
+        UserError: a new run's folder exists, or the folder cannot be written.
     """
-
-    def __init__(self, folder: Path, configuration: str, *, resumed: bool) -> None:
-        self.folder, self.configuration, self.resumed = folder, configuration, resumed
-
-    def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Write config.yaml and environment.json. Raises UserError where the folder cannot be made."""
-        if not trainer.is_global_zero:
-            return
-        make_folder(self.folder, exist_ok=self.resumed)
-        with whole_file(self.folder / CONFIGURATION) as path:
-            path.write_text(self.configuration)
-        if not self.resumed:
-            store = trainer.datamodule.store  # type: ignore[attr-defined]
-            facts = {"versions": versions(), "data": {"file": store.path.name, "fingerprint": store.fingerprint}}
-            with whole_file(self.folder / "environment.json") as path:
-                path.write_text(json.dumps(facts, indent=1) + "\n")
+    make_folder(folder, exist_ok=resumed)
+    with whole_file(folder / CONFIGURATION) as path:
+        path.write_text(configuration)
+    if not resumed:
+        facts = {"versions": versions(), "data": {"file": store.path.name, "fingerprint": store.fingerprint}}
+        with whole_file(folder / "environment.json") as path:
+            path.write_text(json.dumps(facts, indent=1) + "\n")
 
 
 def default_folder(configurations: list[str]) -> Path:
@@ -63,6 +55,7 @@ def make_folder(folder: Path, *, exist_ok: bool) -> None:
         raise UserError(f"{folder}: cannot be written ({error.strerror or error})") from error
 
 
+@rank_zero_only
 def check_new(folder: Path, *, exist_ok: bool = False) -> None:
     """Raise UserError if a new run's folder exists and is not empty."""
     if folder.exists() and not folder.is_dir():

@@ -6,14 +6,14 @@ import argparse
 import importlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from repdib_lightning.errors import UserError, nearest
 
 
 def collect(arguments: list[str]) -> int:
     """``collect ENVIRONMENT PATH [options]``."""
-    from repdib_lightning.environments.collect import COLLECTORS
+    from repdib_lightning.environments import COLLECTORS
 
     name, rest = _choose("collect", "environment", COLLECTORS, arguments)
     print(f"wrote {_call(f'collect {name}', _load(COLLECTORS[name]), rest)}")
@@ -55,10 +55,27 @@ def probe(arguments: list[str]) -> int:
 
 
 def compare(arguments: list[str]) -> int:
-    """``compare DATA OUTPUT BUNDLE [BUNDLE ...]``."""
-    from repdib_lightning.evaluation.compare import compare as compare_bundles
+    """``compare DATA OUTPUT RUN [RUN ...]``: ratios are relative to the first run."""
+    parser = argparse.ArgumentParser(
+        prog="python -m repdib_lightning compare",
+        description="Probe exported runs on one data set, side by side: a table here, an HTML page with pictures.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("data", type=Path, help="a data file with factors")
+    parser.add_argument("output", type=Path, help="the HTML page to write; the numbers go into a .json beside it")
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders that were exported, or bundles")
+    options = parser.parse_args(arguments)
+    bundles: dict[str, Path] = {}
+    for run in options.runs:
+        if run.resolve().name in bundles:
+            raise UserError(f"compare: two runs are called '{run.resolve().name}'")
+        bundles[run.resolve().name] = run / "bundle" if (run / "bundle").is_dir() else run
+    from repdib_lightning.evaluation.report import compare as compare_bundles
 
-    print(_call("compare", compare_bundles, arguments))
+    curves = {name: path.parent / "metrics.csv" for name, path in bundles.items()}
+    known = {name: path for name, path in curves.items() if path.is_file()}
+    print(compare_bundles(bundles, options.data, options.output, metrics=known))
+    print(f"wrote {options.output}")
     return 0
 
 
@@ -66,7 +83,9 @@ def _choose(verb: str, what: str, known: dict[str, str], arguments: list[str]) -
     """The first argument, one of ``known``, and the rest. ``--help`` alone lists the choices."""
     if not arguments or arguments[0] in ("-h", "--help"):
         listing = "\n".join(f"  {name}" for name in sorted(known))
-        print(f"usage: python -m repdib_lightning {verb} {what.upper()} ... (--help after it lists its options)\n{listing}")
+        print(
+            f"usage: python -m repdib_lightning {verb} {what.upper()} ... (--help after it lists its options)\n{listing}"
+        )
         raise SystemExit(0 if arguments else 2)
     if arguments[0] not in known:
         raise UserError(f"{verb}: unknown {what} '{arguments[0]}': {nearest(arguments[0], known)}")
@@ -90,8 +109,20 @@ def _call(verb: str, function: Callable[..., Any], arguments: list[str]) -> Any:
     )
     parser.add_function_arguments(function, as_group=False, as_positional=True, fail_untyped=True)
     try:
-        options = parser.parse_args(arguments)
+        options = parser.parse_args(_spelled_out(function, arguments))
     except argparse.ArgumentError as error:
         known = [option[2:] for action in parser._actions for option in action.option_strings if option[:2] == "--"]
         raise one_line(error, known, {}) from error
     return function(**parser.instantiate(options).as_dict())
+
+
+def _spelled_out(function: Callable[..., Any], arguments: list[str]) -> list[str]:
+    """Give bare flags of yes-or-no parameters their value: ``--overwrite`` means ``--overwrite true``."""
+    hints = get_type_hints(function)
+    flags = {f"--{name}" for name, hint in hints.items() if hint is bool}
+    spelled: list[str] = []
+    for index, argument in enumerate(arguments):
+        following = arguments[index + 1 : index + 2]
+        bare = argument in flags and following not in (["true"], ["false"])
+        spelled.append(f"{argument}=true" if bare else argument)
+    return spelled

@@ -19,7 +19,7 @@ def write_store(
     *,
     lengths: tuple[int, ...] = (13, 9, 11, 12),
     evaluation: tuple[int, ...] = (2, 3),
-    size: int = 20,
+    size: int = 24,
     kind: str | None = "discrete",
     seed: int = 0,
     **options: Any,

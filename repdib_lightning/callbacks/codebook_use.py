@@ -57,7 +57,7 @@ class CodebookUse(Callback):
         if output.codes is not None and self._histogram is not None:
             self._histogram.update(output.codes)
 
-    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+    def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Log what was counted."""
         if self._hook is None:
             return
@@ -69,8 +69,7 @@ class CodebookUse(Callback):
         counts = histogram.compute()
         values = {f"val/perplexity/group_{g}": float(value) for g, value in enumerate(perplexity(counts))}
         values |= {f"val/used/group_{g}": float(value) for g, value in enumerate((counts > 0).sum(-1))}
-        for logger in trainer.loggers:
-            logger.log_metrics(values, step=trainer.global_step)
+        pl_module.log_dict(values)
         shares = counts.sort(-1, descending=True).values / counts.amax(-1, keepdim=True).clamp(min=1)
         for writer in tensorboards(trainer):
             writer.add_image("codes/use", shares[None], trainer.global_step)

@@ -79,6 +79,10 @@ class EpisodeDataModule(pl.LightningDataModule):
             observations[name] = ArraySpec(shape, array.dtype)
         return DataSpec(observations, self.store.actions_spec, self.frame_stack, self.horizon)
 
+    def example(self) -> Batch:
+        """The first two held-out samples. Only after :meth:`setup`."""
+        return self._frames(self._evaluation).__getitems__([0, 1])
+
     def train_dataloader(self) -> ResumableLoader:
         """Shuffled anchors of the training episodes, resumable at any batch."""
         rank, world_size = self._place()

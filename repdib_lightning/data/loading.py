@@ -144,6 +144,6 @@ class _SampleNumbers:
                 epoch, batch = epoch + 1, 0
 
 
-def as_it_is(batch: Batch) -> Batch:
+def as_it_is(batch: Any) -> Any:
     """The collate function of data sets that gather whole batches."""
     return batch

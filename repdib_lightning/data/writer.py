@@ -67,7 +67,11 @@ class EpisodeWriter:
             self._file = h5py.File(self._temporary, "w")
         except OSError as error:
             raise self._cannot_write(error) from error
-        self._allocate(factors or {}, masks or {}, rewards)
+        try:
+            self._allocate(factors or {}, masks or {}, rewards)
+        except OSError as error:
+            self._discard()
+            raise self._cannot_write(error) from error
         self._file.attrs.update({"format": FORMAT, "schema_version": SCHEMA_VERSION})
         for key, value in (attributes or {}).items():
             plain = isinstance(value, (str, int, float, bool))
@@ -181,9 +185,12 @@ class EpisodeWriter:
             if kind is None:
                 self._publish()
         finally:
-            if self._file:
-                self._file.close()
-            self._temporary.unlink(missing_ok=True)
+            self._discard()
+
+    def _discard(self) -> None:
+        if self._file:
+            self._file.close()
+        self._temporary.unlink(missing_ok=True)
 
     def _publish(self) -> None:
         filled = (self._row, self._episode)

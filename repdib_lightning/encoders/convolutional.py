@@ -44,8 +44,9 @@ class ConvolutionalEncoder(Encoder):
         width = 0
         for view in self.views:
             shape = spec.observations[view].shape
-            self.stacks[view] = convolution_stack(shape[0], channels, strides or [2, 1, 1, 1])
-            width += flat_width(self.stacks[view], view, shape)
+            stack = convolution_stack(shape[0], channels, strides or [2, 1, 1, 1])
+            self.stacks[view] = stack
+            width += flat_width(stack, view, shape)
         self.trunk = nn.Sequential(nn.Linear(width, features), nn.LayerNorm(features), nn.Tanh())
         self.apply(initialise_orthogonally)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 
 import torch
-import torchvision
 from torch import Tensor, nn
 
 from repdib_lightning.encoders.base import Encoder
@@ -39,9 +38,13 @@ class ResNetEncoder(Encoder):
         norm: str = "batch",
         views: list[str] | None = None,
     ) -> None:
+        import torchvision  # a second of import that only this encoder needs
+
         super().__init__(spec, features)
         if architecture not in _ARCHITECTURES:
-            raise UserError(f"ResNetEncoder: unknown architecture '{architecture}' {nearest(architecture, _ARCHITECTURES)}")
+            raise UserError(
+                f"ResNetEncoder: unknown architecture '{architecture}' {nearest(architecture, _ARCHITECTURES)}"
+            )
         if norm not in ("batch", "group"):
             raise UserError(f"ResNetEncoder: unknown norm '{norm}' {nearest(norm, ('batch', 'group'))}")
         self.views = image_views(spec, views, "ResNetEncoder")

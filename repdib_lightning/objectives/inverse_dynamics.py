@@ -54,14 +54,20 @@ class InverseDynamics(Objective):
         self.offset_embedding = nn.Embedding(spec.horizon, hidden) if feed_offset and spec.horizon > 1 else None
         inputs = 2 * width + (hidden if self.offset_embedding is not None else 0)
         self.predictor = nn.Sequential(
-            nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, spec.actions.size)
+            nn.Linear(inputs, hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, spec.actions.size),
         )
 
     def forward(self, batch: Batch, encode: Encode) -> ObjectiveOutput:
         """Encode (B, F) frames once and predict the anchor's action from each of the F - 1 futures."""
         assert batch.actions is not None
         latents = encode(batch.observations)
-        prediction = self.predict(latents[:, :1].expand(-1, latents.shape[1] - 1, -1), latents[:, 1:], batch.offsets[:, 1:])
+        prediction = self.predict(
+            latents[:, :1].expand(-1, latents.shape[1] - 1, -1), latents[:, 1:], batch.offsets[:, 1:]
+        )
         if self.actions.kind == "discrete":
             return self._discrete(prediction, batch.actions)
         return self._continuous(prediction, batch.actions)

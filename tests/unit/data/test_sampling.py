@@ -25,7 +25,7 @@ def test_stacks_equal_a_loop_and_stop_at_the_episode_start(store):
         first = store.starts[store.row_episodes[row]]
         assert stacks[row].tolist() == [max(first, row - 2), max(first, row - 1), row]
     frames = gather_stacks(store, "front", np.array([13, 15]), 3)
-    assert frames.shape == (2, 9, 20, 20)
+    assert frames.shape == (2, 9, 24, 24)
     assert frames[:, ::3, 0, 0].tolist() == [[13, 13, 13], [13, 14, 15]]
 
 
@@ -128,7 +128,7 @@ def test_changed_batch_size_is_refused_on_resume(store):
 def test_data_module_splits_and_measures(store_file):
     data = EpisodeDataModule(str(store_file), batch_size=4, horizon=2, frame_stack=2, views=["top"])
     data.setup("fit")
-    assert data.spec.observations["top"].shape == (6, 20, 20) and list(data.spec.observations) == ["top"]
+    assert data.spec.observations["top"].shape == (6, 24, 24) and list(data.spec.observations) == ["top"]
     assert data.spec.horizon == 2 and data.spec.actions.size == 4
     held_out = [row for batch in data.val_dataloader() for row in batch.rows.tolist()]
     trained = [row for batch in data.train_dataloader() for row in batch.rows.tolist()]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -38,9 +37,7 @@ def test_gathering_from_a_chunked_file_gives_the_same(store_file, tmp_path):
     rows = np.array([7, 7, 31, 0])
     slow, fast = EpisodeStore(chunked), EpisodeStore(store_file)
     assert fast.contiguous and not slow.contiguous
-    np.testing.assert_array_equal(
-        slow.gather("observations/front", rows), fast.gather("observations/front", rows)
-    )
+    np.testing.assert_array_equal(slow.gather("observations/front", rows), fast.gather("observations/front", rows))
 
 
 def test_factors_episodes_and_final_rows(store_file):
@@ -75,11 +72,10 @@ def test_pickles_as_its_path(store_file):
 
 
 def test_an_error_while_writing_leaves_nothing(tmp_path):
-    with pytest.raises(ZeroDivisionError):
-        with EpisodeWriter(
-            tmp_path / "x.h5", rows=4, episodes=1, observations={"eye": ArraySpec((1, 2, 2))}, actions=None
-        ):
-            _ = 1 / 0
+    with pytest.raises(ZeroDivisionError), EpisodeWriter(
+        tmp_path / "x.h5", rows=4, episodes=1, observations={"eye": ArraySpec((1, 2, 2))}, actions=None
+    ):
+        _ = 1 / 0
     assert os.listdir(tmp_path) == []
 
 
@@ -95,7 +91,6 @@ def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="cannot be written.*are free"):
         EpisodeWriter(tmp_path / "x.h5", rows=9, episodes=1, observations={"eye": ArraySpec((3, 9, 9))}, actions=None)
     assert os.listdir(tmp_path) == []
-
 
 
 @pytest.mark.parametrize(
