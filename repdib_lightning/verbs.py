@@ -82,10 +82,8 @@ def compare(arguments: list[str]) -> int:
 def _choose(verb: str, what: str, known: dict[str, str], arguments: list[str]) -> tuple[str, list[str]]:
     """The first argument, one of ``known``, and the rest. ``--help`` alone lists the choices."""
     if not arguments or arguments[0] in ("-h", "--help"):
-        listing = "\n".join(f"  {name}" for name in sorted(known))
-        print(
-            f"usage: python -m repdib_lightning {verb} {what.upper()} ... (--help after it lists its options)\n{listing}"
-        )
+        usage = f"usage: python -m repdib_lightning {verb} {what.upper()} ... (--help after it lists its options)"
+        print(usage, *(f"  {name}" for name in sorted(known)), sep="\n")
         raise SystemExit(0 if arguments else 2)
     if arguments[0] not in known:
         raise UserError(f"{verb}: unknown {what} '{arguments[0]}': {nearest(arguments[0], known)}")

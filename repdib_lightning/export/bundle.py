@@ -97,7 +97,8 @@ def _check_target(target: Path, overwrite: bool) -> None:
     is_empty = target.is_dir() and not any(target.iterdir())
     if not is_bundle and not is_empty:
         raise UserError(f"{target}: is no bundle, so --overwrite does not replace it; choose another folder")
-    foreign = sorted(p.name for p in target.iterdir() if p.name != CONFIG and not p.name.startswith("model."))
+    ours = {CONFIG, "probe.json"}  # a probe of the bundle that is replaced says nothing about the new one
+    foreign = sorted(p.name for p in target.iterdir() if p.name not in ours and not p.name.startswith("model."))
     if foreign:
         raise UserError(f"{target}: holds '{foreign[0]}', which --overwrite would delete; choose another folder")
 

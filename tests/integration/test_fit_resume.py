@@ -1,4 +1,4 @@
-"""A fit that is killed and resumed through the command line gives the same losses, bit for bit, and the same weights."""
+"""A fit killed and resumed through the command line gives the same losses, bit for bit, and the same weights."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import random
 import signal
@@ -161,6 +162,7 @@ def kill_in_save(number: int) -> None:
 def train(folder: str, options: dict[str, Any]) -> None:
     """Run or resume (``options["resume"]``) the toy in a run folder, until it ends or is ended."""
     torch.set_num_threads(1)
+    multiprocessing.set_start_method("fork", force=True)
     run = Path(folder)
     run.mkdir(exist_ok=True)
     sys.stderr = (run / "stderr.txt").open("a")

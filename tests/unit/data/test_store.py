@@ -72,8 +72,9 @@ def test_pickles_as_its_path(store_file):
 
 
 def test_an_error_while_writing_leaves_nothing(tmp_path):
-    with pytest.raises(ZeroDivisionError), EpisodeWriter(
-        tmp_path / "x.h5", rows=4, episodes=1, observations={"eye": ArraySpec((1, 2, 2))}, actions=None
+    with (
+        pytest.raises(ZeroDivisionError),
+        EpisodeWriter(tmp_path / "x.h5", rows=4, episodes=1, observations={"eye": ArraySpec((1, 2, 2))}, actions=None),
     ):
         _ = 1 / 0
     assert os.listdir(tmp_path) == []
@@ -88,7 +89,7 @@ def test_an_existing_file_is_kept(store_file, make_store):
 
 def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "statvfs", lambda path: os.statvfs_result((1, 1, 1, 1, 1, 0, 0, 0, 0, 0)))
-    with pytest.raises(UserError, match="cannot be written.*are free"):
+    with pytest.raises(UserError, match=r"cannot be written.*are free"):
         EpisodeWriter(tmp_path / "x.h5", rows=9, episodes=1, observations={"eye": ArraySpec((3, 9, 9))}, actions=None)
     assert os.listdir(tmp_path) == []
 
@@ -135,7 +136,7 @@ def test_newer_schema(store_file):
 def test_files_that_are_no_stores(store_file, content):
     whole = store_file.read_bytes()
     store_file.write_bytes(whole[: len(whole) // 2] if content is None else content)
-    with pytest.raises(UserError, match="truncated|not a readable HDF5 file"):
+    with pytest.raises(UserError, match=r"truncated|not a readable HDF5 file"):
         EpisodeStore(store_file)
 
 
@@ -147,7 +148,7 @@ def test_a_missing_file_names_the_nearest(store_file):
 def test_foreign_hdf5(tmp_path):
     with h5py.File(tmp_path / "f.h5", "w") as file:
         file["image"] = np.zeros(3)
-    with pytest.raises(UserError, match="not a store of this package.*image.*import"):
+    with pytest.raises(UserError, match=r"not a store of this package.*image.*import"):
         EpisodeStore(tmp_path / "f.h5")
 
 

@@ -57,7 +57,7 @@ def test_views_are_chosen_and_unknown_ones_named():
     inputs = pictures(spec)
     changed = inputs | {"front": 255 - inputs["front"]}
     assert torch.equal(encoder(inputs), encoder(changed))
-    with pytest.raises(UserError, match="'tob'.*did you mean 'top'"):
+    with pytest.raises(UserError, match=r"'tob'.*did you mean 'top'"):
         ConvolutionalEncoder(spec, views=["tob"])
     with pytest.raises(UserError, match="needs a picture"):
         ConvolutionalEncoder(DataSpec({"joints": ArraySpec((7,), "float32")}))
