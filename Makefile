@@ -21,7 +21,7 @@ install: .venv/installed
 # The same encoder without a bottleneck and with RepDIB, on a small recording; what each kept, side by side.
 demo: install
 	rm -rf $(DEMO)
-	test -f data/robot_arm_demo.h5 || $(RUN) collect robot_arm data/robot_arm_demo.h5 --samples 4000 --episode_length 200
+	test -f data/robot_arm_demo.h5 || $(RUN) collect robot_arm data/robot_arm_demo.h5 --samples 4000 --episode_length 100
 	for kind in none repdib; do \
 		$(RUN) fit --config robot_arm --config bottleneck/$$kind --config demo --run $(DEMO)/$$kind && \
 		$(RUN) export $(DEMO)/$$kind || exit 1; \

@@ -45,8 +45,16 @@ SLOTS: dict[str, list[str]] = {
 
 _DESCRIPTION = """Train a representation. Without --config this is the default run: the simulated robot arm
 (3x3 cells, two cameras, 14,000 samples, collected on first use) with multi-step inverse dynamics and the RepDIB
-bottleneck (VIB, then 8 groups x 50 codes), 2,500 steps; about ten minutes on two cores. Overlays change it:
+bottleneck (VIB, then 8 groups x 50 codes), 1,000 steps; about five minutes on two cores. Overlays change it:
 --config robot_arm --config bottleneck/none. Packaged configurations: {names}."""
+
+_HARMLESS = (
+    ".*does not have many workers.*",
+    ".*LightningCLI's args parameter.*",
+    ".*exists and is not empty.*",
+    ".*treespec.*",
+)
+"""Warnings of the libraries below that tell a user nothing."""
 
 
 class TrainingCLI(LightningCLI):
@@ -149,16 +157,13 @@ def _prepare(arguments: list[str]) -> TrainingCLI:
     """Parse and build everything; nothing is written."""
     for chatty in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
-    for harmless in (
-        ".*does not have many workers.*",
-        ".*LightningCLI's args parameter.*",
-        ".*exists and is not empty.*",
-    ):
+    for harmless in _HARMLESS:
         warnings.filterwarnings("ignore", message=harmless)
     expanded = configurations.expand(arguments)
     if not any(argument.startswith("--config") for argument in expanded):
         expanded = ["--config", str(configurations.resolve(DEFAULT)), *expanded]
-    parser = {"exit_on_error": False, "allow_abbrev": False, "prog": "python -m repdib_lightning fit"}
+    command = "python -m repdib_lightning fit"
+    parser = {"exit_on_error": False, "allow_abbrev": False, "prog": command, "usage": f"{command} [--KEY VALUE ...]"}
     return TrainingCLI(
         RepresentationModule,
         pl.LightningDataModule,

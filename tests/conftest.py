@@ -8,10 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from repdib_lightning.data.schema import FactorSpec
 from repdib_lightning.data.writer import EpisodeWriter
 from repdib_lightning.records import ActionSpec, ArraySpec
+
+torch.set_num_threads(1)  # tests are small; threads that wait for each other on a busy machine are not
 
 
 def write_store(

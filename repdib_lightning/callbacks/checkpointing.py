@@ -40,6 +40,7 @@ class RunCheckpoint(Checkpoint):
         self.exact_resume, self.every_n_steps, self.keep = exact_resume, every_n_steps, keep
         self.newest: Path | None = None
         self._saved_step = -1
+        self._abandoned: list[Path] = []
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Clear what a killed process left half-written."""
@@ -48,6 +49,7 @@ class RunCheckpoint(Checkpoint):
             sweep_temporaries(self.folder)
         if trainer.ckpt_path is not None:
             self.newest, self._saved_step = Path(trainer.ckpt_path), trainer.global_step
+            self._abandoned = [path for path in listed(self.folder) if step_of(path) > trainer.global_step]
 
     def on_train_batch_start(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int
@@ -83,11 +85,12 @@ class RunCheckpoint(Checkpoint):
         trainer.save_checkpoint(path, weights_only=False)
         self.newest, self._saved_step = path, step
         if trainer.is_global_zero:
-            self._retire(step)
+            self._retire(path)
 
-    def _retire(self, step: int) -> None:
-        """Remove old checkpoints, and those of later steps: damaged ones that the run had to go back behind."""
-        found = listed(self.folder)
-        later = [path for path in found if step_of(path) > step]
-        for path in later + found[len(later) + self.keep :]:
+    def _retire(self, saved: Path) -> None:
+        """Remove what is too old, and what the run had to go back behind on resume: damaged, most likely."""
+        for path in set(self._abandoned) - {saved}:
+            path.unlink(missing_ok=True)
+        self._abandoned = []
+        for path in listed(self.folder)[self.keep :]:
             path.unlink(missing_ok=True)

@@ -12,7 +12,6 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_warn
 
 from repdib_lightning.callbacks import generators
 from repdib_lightning.callbacks.loop_progress import Progress
-from repdib_lightning.callbacks.metrics_file import ContinuedCSVLogger
 from repdib_lightning.errors import UserError
 
 _KEY = "exact_resume"
@@ -96,9 +95,6 @@ class ExactResume(Checkpoint):
                 f" has {batches:.0f} now; resume with the same data and batch size"
             )
         self._place_loaders(trainer)
-        for logger in trainer.loggers:
-            if isinstance(logger, ContinuedCSVLogger) and trainer.is_global_zero:
-                logger.continue_from(trainer.global_step)
 
     def on_train_batch_start(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int

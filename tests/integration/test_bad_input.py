@@ -48,7 +48,7 @@ def fit(*options: str) -> list[str]:
     ("arguments", "wanted"),
     [
         (["fti"], "unknown verb 'fti': did you mean 'fit'?"),
-        (["fit", "--config", "robot_amr"], "--config robot_amr: no such file or packaged configuration; did you mean 'rob"),
+        (["fit", "--config", "robot_amr"], "--config robot_amr: no such file or packaged configuration; did you mean"),
         (fit("--model.shfit", "1"), "unknown option --model.shfit: did you mean '--model.shift'?"),
         (fit("--trainer.max_epoch", "3"), "unknown option --trainer.max_epoch: did you mean '--trainer.max_epochs'?"),
         (fit("--model.encoder.init_args.featurs", "8"), "model.encoder.featurs: did you mean 'features'?"),

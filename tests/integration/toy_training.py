@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, TensorDataset
 
 from repdib_lightning.callbacks import exit_codes, last_good, run_callbacks, run_plugins
-from repdib_lightning.callbacks.checkpoint_files import DigestingFile
-from repdib_lightning.callbacks.metrics_file import ContinuedCSVLogger
+from repdib_lightning.callbacks.checkpoint_files import DigestingFile, step_of
+from repdib_lightning.callbacks.metrics_csv import MetricsCSV
 from repdib_lightning.errors import UserError
 
 EPOCH = 5
@@ -165,39 +165,41 @@ def train(folder: str, options: dict[str, Any]) -> None:
     multiprocessing.set_start_method("fork", force=True)
     run = Path(folder)
     run.mkdir(exist_ok=True)
-    sys.stderr = (run / "stderr.txt").open("a")
-    sys.stdout = sys.stderr
-    pl.seed_everything(7 if not options.get("resume") else 8, verbose=False)
-    options = {"record": str(run / "record"), **options}
+    sys.stdout = sys.stderr = (run / "stderr.txt").open("a")
+    pl.seed_everything(8 if options.get("resume") else 7, verbose=False)
     if options.get("save_killed"):
         kill_in_save(options["save_killed"])
-    module = ToyModule(options)
-    callbacks = [*run_callbacks(run, options.get("every", 2), options.get("keep", 3))]
-    if options.get("stop"):
-        callbacks.append(Stop(options["stop"], options.get("how", "kill")))
-    trainer = pl.Trainer(
-        default_root_dir=str(run),
-        accelerator="cpu",
-        callbacks=callbacks,
-        plugins=run_plugins(),
-        logger=ContinuedCSVLogger(str(run), name="", version="") if options.get("csv") else False,
-        log_every_n_steps=1,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        accumulate_grad_batches=options.get("accumulate", 1),
-        num_sanity_val_steps=1,
-        **options.get("trainer", {"max_epochs": 3}),
-    )
-    validation = None
-    if options.get("validate", True):
-        validation = DataLoader(TensorDataset(torch.linspace(0, 1, 8).view(4, 2)), batch_size=2)
+    module = ToyModule({"record": str(run / "record"), **options})
+    validation = DataLoader(TensorDataset(torch.linspace(0, 1, 8).view(4, 2)), batch_size=2)
     loader = ToyLoader(options.get("workers", 0), options.get("draws", False))
     try:
+        path = last_good(run) if options.get("resume") else None
         with exit_codes():
-            path = last_good(run) if options.get("resume") else None
-            trainer.fit(module, loader, validation, ckpt_path=path)
+            trainer_of(run, path, options).fit(
+                module, loader, validation if options.get("validate", True) else None, ckpt_path=path
+            )
     except UserError as error:
         (run / "error.txt").write_text(str(error))
         raise SystemExit(2) from error
     weights = {name: value.double().flatten().tolist() for name, value in module.state_dict().items()}
     (run / "weights.json").write_text(json.dumps(weights))
+
+
+def trainer_of(run: Path, path: Path | None, options: dict[str, Any]) -> pl.Trainer:
+    """A Trainer with everything that makes a run safe."""
+    callbacks = run_callbacks(run, options.get("every", 2))
+    if options.get("stop"):
+        callbacks.append(Stop(options["stop"], options.get("how", "kill")))
+    return pl.Trainer(
+        default_root_dir=str(run),
+        accelerator="cpu",
+        callbacks=callbacks,
+        plugins=run_plugins(),
+        logger=MetricsCSV(run, None if path is None else step_of(path)) if options.get("csv") else False,
+        log_every_n_steps=1,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        accumulate_grad_batches=options.get("accumulate", 1),
+        num_sanity_val_steps=1,
+        **options["trainer"],
+    )
