@@ -37,7 +37,7 @@ class AtomicCheckpointIO(CheckpointIO):
         with whole_file(Path(path)) as temporary, open(temporary, "wb") as handle:
             digesting = DigestingFile(handle)
             try:
-                torch.save(content, digesting)
+                torch.save(content, digesting)  # type: ignore[arg-type]
             except RuntimeError:
                 if digesting.error is not None:
                     raise digesting.error from None

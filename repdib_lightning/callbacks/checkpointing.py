@@ -44,7 +44,8 @@ class RunCheckpoint(Checkpoint):
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Clear what a killed process left half-written."""
-        assert self.exact_resume in trainer.callbacks, "RunCheckpoint needs its ExactResume among the callbacks"
+        known: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
+        assert self.exact_resume in known, "RunCheckpoint needs its ExactResume among the callbacks"
         if trainer.is_global_zero:
             sweep_temporaries(self.folder)
         if trainer.ckpt_path is not None:

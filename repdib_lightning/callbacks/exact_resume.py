@@ -115,7 +115,9 @@ class ExactResume(Checkpoint):
         for loader, state in zip(loaders, states, strict=True):
             loader.load_state_dict(state)
             assert loader.state_dict() == state, f"{type(loader).__name__} does not load what it saves"
-        iter(trainer.fit_loop._data_fetcher)  # what was fetched ahead belongs to the old position
+        fetcher = trainer.fit_loop._data_fetcher
+        assert fetcher is not None
+        iter(fetcher)  # what was fetched ahead belongs to the old position
 
 
 def _resumable_loaders(trainer: pl.Trainer) -> list[Any]:

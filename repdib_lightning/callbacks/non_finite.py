@@ -94,6 +94,7 @@ def _broken_parameters(module: pl.LightningModule) -> list[str]:
 
 
 def _way_back(trainer: pl.Trainer) -> str:
-    paths = [callback.newest for callback in trainer.callbacks if isinstance(callback, RunCheckpoint)]
+    callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
+    paths = [callback.newest for callback in callbacks if isinstance(callback, RunCheckpoint)]
     newest = paths[0] if paths else None
     return f"the last good checkpoint is {newest}" if newest else "there is no checkpoint yet"

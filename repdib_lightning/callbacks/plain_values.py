@@ -36,7 +36,7 @@ def plain(value: Any, key: str = "checkpoint") -> Any:
         return plain(value.value, key)
     if isinstance(value, Path):
         return str(value)
-    for kind in (bool, int, float, str, bytes):
+    for kind in (int, float, str):
         if isinstance(value, kind):
             return kind(value)
     if isinstance(value, Mapping):

@@ -2,7 +2,8 @@
 
 The paper scores a representation of the robot arm by probes of the time step, the picture and the cell (section on the
 robot arm), and prints them relative to a run without bottleneck only. Here each probe has one direction, up:
-a high score of a state factor is good, a high score of a noise factor is noise that leaked in.
+a high score of a state factor is good, a high score of a noise factor is noise that leaked in. The ``mlp`` probe is the
+``linear`` one with a learned correction, so it reads at least as much up to the noise of the inner folds.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import torch
@@ -17,11 +19,15 @@ import torch
 from repdib_lightning.data.schema import FactorSpec
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.evaluation.linear import PENALTIES, LinearMap, Ridge, fit_logistic
-from repdib_lightning.evaluation.mlp import fit_mlp
+from repdib_lightning.evaluation.mlp import Fold, Task, fit_correction
 from repdib_lightning.evaluation.splits import episode_folds
 
 PROBES = ("linear", "mlp")
 RIDGE_PENALTIES = (10.0, *PENALTIES, 1e-5, 1e-6)
+ABSENT = -1e4
+"""A logit so low that its class is never predicted, and small enough for float32."""
+
+Predict = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -41,7 +47,7 @@ class ProbeScore:
         score: accuracy, or R2 (mean over dimensions); None where the factor does not vary in the score half.
         raw_kept: (score - chance) / (1 - chance), unclipped; None where chance is already perfect.
         kept: ``raw_kept`` clipped to [0, 1].
-        choice: what the inner split of the fit half chose (penalty, or epochs).
+        choice: what the inner split of the fit half chose (penalty; for ``mlp`` also epochs, where 0 is the linear probe).
     """
 
     score: float | None
@@ -98,12 +104,12 @@ def measure(probe: str, fit: Half, score: Half, seed: int) -> ProbeScore:
     A class that occurs only in the score half cannot be predicted, so its rows count as wrong.
     """
     with _one_thread():
-        if fit.target.ndim == 1:
-            fitted, choice = (_linear_classes if probe == "linear" else _mlp_classes)(fit, seed)
-            value: float | None = float(np.mean(fitted(score.features) == score.target))
-        else:
-            fitted, choice = (_linear_values if probe == "linear" else _mlp_values)(fit, seed)
-            value = explained(fitted(score.features), score.target)
+        predict, choice = _predictor(probe, fit, seed)
+        predicted = predict(score.features)
+    if fit.target.ndim == 1:
+        value: float | None = float(np.mean(predicted == score.target))
+    else:
+        value = explained(predicted, score.target)
     return rate(value, chance(fit, score), choice)
 
 
@@ -134,69 +140,108 @@ def explained(predicted: np.ndarray, target: np.ndarray) -> float | None:
     return float(np.mean(1.0 - left[varies] / total[varies])) if varies.any() else None
 
 
-Predict = Callable[[np.ndarray], np.ndarray]
+@dataclass(frozen=True)
+class _Linear:
+    """A linear probe: the penalty that the inner folds chose, its fit on all rows, and one without each fold."""
+
+    penalty: float
+    whole: LinearMap
+    without: list[LinearMap]
 
 
-def _linear_classes(fit: Half, seed: int) -> tuple[Predict, dict[str, float]]:
-    """Logistic regression; the penalty with the best accuracy over the inner folds, the strongest of equals."""
+def _predictor(probe: str, fit: Half, seed: int) -> tuple[Predict, dict[str, float]]:
+    """Fit a probe; predictions are classes (n,), or values (n, K) in the target's own units."""
     folds = episode_folds(fit.episodes)
-    paths = [_LogisticPath(fit.features[~held_out], fit.target[~held_out]) for held_out in folds]
-    right: list[int] = []
+    if fit.target.ndim == 1:
+        classes, target = np.unique(fit.target, return_inverse=True)
+        linear = _best_logistic(fit.features, target, folds)
+        mapped, choice = _corrected(linear, fit.features, target, folds, seed) if probe == "mlp" else _plain(linear)
+        return (lambda features: classes[mapped(features).argmax(1)]), choice
+    mean, scale = _moments(fit.target)
+    target = (fit.target - mean) / scale
+    linear = _best_ridge(fit.features, target, folds)
+    mapped, choice = _corrected(linear, fit.features, target, folds, seed) if probe == "mlp" else _plain(linear)
+    return (lambda features: mapped(features) * scale + mean), choice
+
+
+def _plain(linear: _Linear) -> tuple[Predict, dict[str, float]]:
+    return linear.whole, {"penalty": linear.penalty}
+
+
+def _corrected(
+    linear: _Linear, features: np.ndarray, target: np.ndarray, folds: list[np.ndarray], seed: int
+) -> tuple[Predict, dict[str, float]]:
+    parts = [
+        Fold(Task(features[~rows], target[~rows], base), features[rows], partial(_error, target=target[rows]))
+        for rows, base in zip(folds, linear.without, strict=True)
+    ]
+    mapped = fit_correction(Task(features, target, linear.whole), parts, seed)
+    return mapped, {"penalty": linear.penalty, "epochs": mapped.epochs}
+
+
+def _error(predicted: np.ndarray, target: np.ndarray) -> float:
+    """Wrong rows, or squared error; summed over rows, so that folds add up."""
+    wrong = predicted.argmax(1) != target if target.ndim == 1 else np.square(predicted - target)
+    return float(wrong.sum())
+
+
+def _best_logistic(features: np.ndarray, index: np.ndarray, folds: list[np.ndarray]) -> _Linear:
+    """Logistic regression; the penalty with the best accuracy over the inner folds, the strongest of equals.
+
+    Args:
+        features: (n, M), standardised. index: (n,) classes in [0, K), each of which occurs. folds: held-out rows.
+    """
+    classes = int(index.max()) + 1
+    paths = [_LogisticPath(features[~held_out], index[~held_out]) for held_out in folds]
+    wrong: list[float] = []
+    without: list[list[LinearMap]] = []
     for penalty in PENALTIES:
-        predicts = [path.next(penalty) for path in paths]
-        hits = [p(fit.features[rows]) == fit.target[rows] for p, rows in zip(predicts, folds, strict=True)]
-        right.append(int(sum(hit.sum() for hit in hits)))
-        if right[-1] == len(fit.target):
+        without.append([path.next(penalty, classes) for path in paths])
+        errors = [_error(m(features[rows]), index[rows]) for m, rows in zip(without[-1], folds, strict=True)]
+        wrong.append(sum(errors))
+        if wrong[-1] == 0.0:
             break
-    best = int(np.argmax(right))
-    final = _LogisticPath(fit.features, fit.target)
-    return [final.next(penalty) for penalty in PENALTIES[: best + 1]][-1], {"penalty": PENALTIES[best]}
+    best = int(np.argmin(wrong))
+    final = _LogisticPath(features, index)
+    whole = [final.next(penalty, classes) for penalty in PENALTIES[: best + 1]][-1]
+    return _Linear(PENALTIES[best], whole, without[best])
 
 
 class _LogisticPath:
-    """Classifiers for weaker and weaker penalties, each started from the one before."""
+    """Logits of all K classes for weaker and weaker penalties, each fit started from the one before."""
 
-    def __init__(self, features: np.ndarray, labels: np.ndarray) -> None:
+    def __init__(self, features: np.ndarray, index: np.ndarray) -> None:
         self._features = features
-        self._classes, self._index = np.unique(labels, return_inverse=True)
+        self._classes, self._index = np.unique(index, return_inverse=True)
         self._last: LinearMap | None = None
 
-    def next(self, penalty: float) -> Predict:
+    def next(self, penalty: float, classes: int) -> LinearMap:
         self._last = fit_logistic(self._features, self._index, len(self._classes), penalty, self._last)
-        return _class_of(self._last, self._classes)
+        return _widened(self._last, self._classes, classes)
 
 
-def _class_of(logits: Predict, classes: np.ndarray) -> Predict:
-    return lambda features: classes[logits(features).argmax(1)]
+def _widened(narrow: LinearMap, present: np.ndarray, classes: int) -> LinearMap:
+    """Logits of the classes that a fold lacks are too low to be predicted, and to be corrected."""
+    weight, bias = np.zeros((len(narrow.weight), classes)), np.full(classes, ABSENT)
+    weight[:, present], bias[present] = narrow.weight, narrow.bias
+    return LinearMap(weight, bias)
 
 
-def _linear_values(fit: Half, seed: int) -> tuple[Predict, dict[str, float]]:
-    """Ridge regression; the penalty with the smallest squared error over the inner folds, the strongest of equals."""
-    mean, scale = _moments(fit.target)
-    target = (fit.target - mean) / scale
-    errors = np.zeros(len(RIDGE_PENALTIES))
-    for held_out in episode_folds(fit.episodes):
-        ridge = Ridge(fit.features[~held_out], target[~held_out])
-        for i, penalty in enumerate(RIDGE_PENALTIES):
-            errors[i] += np.square(ridge.solve(penalty)(fit.features[held_out]) - target[held_out]).sum()
-    penalty = RIDGE_PENALTIES[int(errors.argmin())]
-    solution = Ridge(fit.features, target).solve(penalty)
-    return (lambda features: solution(features) * scale + mean), {"penalty": penalty}
+def _best_ridge(features: np.ndarray, target: np.ndarray, folds: list[np.ndarray]) -> _Linear:
+    """Ridge regression; the penalty with the smallest squared error over the inner folds, the strongest of equals.
+
+    Args:
+        features: (n, M), standardised. target: (n, K), standardised. folds: held-out rows.
+    """
+    ridges = [Ridge(features[~held_out], target[~held_out]) for held_out in folds]
+    errors = [
+        sum(_error(r.solve(penalty)(features[rows]), target[rows]) for r, rows in zip(ridges, folds, strict=True))
+        for penalty in RIDGE_PENALTIES
+    ]
+    penalty = RIDGE_PENALTIES[int(np.argmin(errors))]
+    return _Linear(penalty, Ridge(features, target).solve(penalty), [ridge.solve(penalty) for ridge in ridges])
 
 
 def _moments(target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     scale = target.std(0)
     return target.mean(0), np.where(scale > 0, scale, 1.0)
-
-
-def _mlp_classes(fit: Half, seed: int) -> tuple[Predict, dict[str, float]]:
-    classes, index = np.unique(fit.target, return_inverse=True)
-    network = fit_mlp(fit.features, index, len(classes), episode_folds(fit.episodes)[0], seed)
-    return _class_of(network, classes), {"epochs": network.epochs}
-
-
-def _mlp_values(fit: Half, seed: int) -> tuple[Predict, dict[str, float]]:
-    mean, scale = _moments(fit.target)
-    target = (fit.target - mean) / scale
-    network = fit_mlp(fit.features, target, target.shape[1], episode_folds(fit.episodes)[0], seed)
-    return (lambda features: network(features) * scale + mean), {"epochs": network.epochs}

@@ -35,6 +35,8 @@ def _child(folder: str, arguments: list[str]) -> None:
     from repdib_lightning.__main__ import main
 
     torch.set_num_threads(1)
+    # Loader workers notice the death of the process that forked them; a fork server would outlive it, and they too.
+    multiprocessing.set_start_method("fork", force=True)
     with open("output.txt", "a") as output:
         sys.stdout = sys.stderr = output
         sys.exit(main(arguments))
