@@ -4,9 +4,10 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3; do $$p -c '$(SUITABLE)
 BIN := .venv/bin
 RUN := $(BIN)/python -m repdib_lightning
 DEMO := runs/demo
-STEPS ?= 700
+SEED ?= 0
+FULL := runs/robot_arm/seed_$(SEED)
 
-.PHONY: install demo test lint clean
+.PHONY: install demo robot-arm test lint clean
 
 install: .venv/installed
 
@@ -27,6 +28,16 @@ demo: install
 		$(RUN) export $(DEMO)/$$kind || exit 1; \
 	done
 	$(RUN) compare data/robot_arm_demo.h5 $(DEMO)/report.html $(DEMO)/none $(DEMO)/repdib
+
+# The same comparison at full size: 14,000 samples, the default configuration, the same steps for both.
+robot-arm: install
+	rm -rf $(FULL)
+	test -f data/robot_arm.h5 || $(RUN) collect robot_arm data/robot_arm.h5
+	for kind in none repdib; do \
+		$(RUN) fit --config robot_arm --config bottleneck/$$kind --seed_everything $(SEED) --data.seed $(SEED) \
+			--run $(FULL)/$$kind && $(RUN) export $(FULL)/$$kind || exit 1; \
+	done
+	$(RUN) compare data/robot_arm.h5 $(FULL)/report.html $(FULL)/none $(FULL)/repdib
 
 test: install lint
 	$(BIN)/python -m pytest

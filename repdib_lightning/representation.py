@@ -7,7 +7,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from lightning.pytorch.cli import OptimizerCallable
+from lightning.pytorch.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor
 
 from repdib_lightning.bottlenecks.base import Bottleneck
@@ -32,6 +32,7 @@ class RepresentationModule(pl.LightningModule):
         bottleneck: builds the bottleneck from the width M.
         objective: builds the objective from M and the spec.
         optimizer: builds the optimiser from the parameters.
+        scheduler: builds a learning-rate scheduler from the optimiser, advanced at every step; none by default.
         loss_weights: weight of each named loss term; unnamed ones keep their default (kl 0.01, commitment 0.25,
             all others 1).
         warmup: term -> steps over which its weight rises linearly from 0.
@@ -48,13 +49,14 @@ class RepresentationModule(pl.LightningModule):
         bottleneck: Callable[[int], Bottleneck],
         objective: Callable[[int, DataSpec], Objective],
         optimizer: OptimizerCallable = torch.optim.Adam,
+        scheduler: LRSchedulerCallable | None = None,
         loss_weights: dict[str, float] | None = None,
         warmup: dict[str, int] | None = None,
         shift: int = 4,
     ) -> None:
         super().__init__()
         self.build_encoder, self.build_bottleneck, self.build_objective = encoder, bottleneck, objective
-        self.build_optimizer = optimizer
+        self.build_optimizer, self.build_scheduler = optimizer, scheduler
         self.loss_weights = {**DEFAULT_LOSS_WEIGHTS, **(loss_weights or {})}
         self.named_weights = sorted({*(loss_weights or {}), *(warmup or {})})
         self.warmup = warmup or {}
@@ -94,8 +96,12 @@ class RepresentationModule(pl.LightningModule):
                 )
 
     def configure_optimizers(self) -> Any:
-        """One optimiser over all parameters."""
-        return self.build_optimizer(self.parameters())
+        """One optimiser over all parameters, and its scheduler."""
+        optimizer = self.build_optimizer(self.parameters())
+        if self.build_scheduler is None:
+            return optimizer
+        scheduler = {"scheduler": self.build_scheduler(optimizer), "interval": "step"}
+        return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
     def forward(self, observations: dict[str, Tensor]) -> BottleneckOutput:
         """Pass name -> (N, *shape) through encoder and bottleneck, without augmentation."""

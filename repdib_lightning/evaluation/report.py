@@ -75,7 +75,7 @@ def compare(
     Args:
         bundles: run name -> folder of an exported encoder; ratios are relative to the first.
         data: a store with factors and at least two evaluation episodes.
-        output: the HTML file. A ``.json`` beside it holds every report in full.
+        output: the HTML file. A ``.json`` beside it holds every report in full, a ``.png`` the bars.
         metrics: run name -> metrics.csv, for the training curves.
         title, probes, device, seed, progress: as in :func:`repdib_lightning.evaluation.probe.probe_bundle`.
 
@@ -99,13 +99,15 @@ def compare(
 
 
 def write_comparison(output: Path, runs: Mapping[str, RunResult], store: EpisodeStore, *, title: str) -> None:
-    """Write the page of several probed runs, and the figures behind it as JSON beside it (same name, ``.json``)."""
+    """Write the page of several probed runs; beside it the numbers (``.json``) and the bars of kept (``.png``)."""
     output = Path(output)
     reports = {name: run.report for name, run in runs.items()}
     plain = json.dumps({name: report.to_dict() for name, report in reports.items()}, indent=2, allow_nan=False)
     page = render_page(title, comparison_sections(runs, store))
     with whole_file(output.with_suffix(".json")) as aside:
         aside.write_text(plain + "\n")
+    with whole_file(output.with_suffix(".png")) as aside:
+        aside.write_bytes(figures.kept_bars(reports))
     with whole_file(output) as aside:
         aside.write_text(page, encoding="utf-8")
 

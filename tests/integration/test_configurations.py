@@ -42,7 +42,21 @@ def test_every_configuration_trains(here, name):
     overlay = [] if name == "robot_arm" else ["--config", name]
     assert main(["fit", "--config", "robot_arm", *overlay, *SMALL, "--run", "runs/x"]) == 0
     assert Path("runs/x/checkpoints/step-00000003.ckpt").is_file()
-    assert {"config.yaml", "status.json", "metrics.csv", "environment.json"} <= {p.name for p in Path("runs/x").iterdir()}
+    written = {path.name for path in Path("runs/x").iterdir()}
+    assert {"config.yaml", "status.json", "metrics.csv", "environment.json", "bundle.json"} <= written
+
+
+def test_a_missing_recording_is_collected_first(here, recording, monkeypatch):
+    asked = {}
+
+    def collect(path, **options):
+        asked.update(options)
+        shutil.copy(recording, path)
+
+    monkeypatch.setattr("repdib_lightning.environments.collect.collect_robot_arm", collect)
+    Path("data/robot_arm.h5").unlink()
+    assert main(["fit", *SMALL, "--run", "runs/x"]) == 0
+    assert asked == {"samples": 14_000, "seed": 0}
 
 
 def test_the_saved_configuration_is_the_whole_run(here):
@@ -61,7 +75,7 @@ def readme_commands() -> list[list[str]]:
 
 def test_every_command_of_the_readme(here, monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "tests/unit/data/importers")
-    from test_image_folder import write_images, write_csv
+    from test_image_folder import write_csv, write_images
     from vd4rl_files import as_npz, record, write_npz
 
     for index in range(3):
@@ -99,7 +113,7 @@ def test_make_targets_of_the_readme_exist():
 
 
 def test_help_is_quick_and_names_the_default_run():
-    """CPU seconds of ``--help`` in a fresh interpreter: below half a second, whatever the machine is doing beside it."""
+    """CPU seconds of ``--help`` in a fresh interpreter: below half a second, however busy the machine is."""
     timer = "import resource, sys; from repdib_lightning.__main__ import main; main(['--help']);"
     timer += "usage = resource.getrusage(resource.RUSAGE_SELF); print(usage.ru_utime + usage.ru_stime)"
     result = subprocess.run([sys.executable, "-c", timer], capture_output=True, text=True, check=True)

@@ -24,6 +24,7 @@ def arguments(workers: int) -> list[str]:
         *("--data.batch_size", "4", "--data.horizon", "2", "--data.workers", str(workers)),
         *("--model.encoder.init_args.features", "16", "--model.bottleneck.init_args.start_step", "3"),
         *("--model.bottleneck.init_args.revive_after", "2", "--model.bottleneck.init_args.codes", "6"),
+        *("--model.scheduler", "torch.optim.lr_scheduler.CosineAnnealingLR", "--model.scheduler.T_max", str(STEPS)),
         *("--trainer.max_steps", str(STEPS), "--trainer.val_check_interval", "2", "--trainer.log_every_n_steps", "1"),
         *("--checkpoint_every", "2", "--trainer.enable_progress_bar", "false"),
     ]
@@ -82,3 +83,9 @@ def test_two_fresh_runs_are_equal(whole, tmp_path, make_store):
     make_store(tmp_path / "small.h5")
     assert command(tmp_path, *arguments(2)) == 0
     assert curve(tmp_path / "run") == curve(whole / "run")
+
+
+def test_the_scheduler_has_advanced_at_every_step(whole):
+    """The cosine of T_max = all steps ends at zero."""
+    state = torch.load(last_good(whole / "run"), weights_only=True)["optimizer_states"][0]
+    assert state["param_groups"][0]["lr"] < 1e-8

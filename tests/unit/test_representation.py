@@ -87,7 +87,7 @@ def test_a_rehearsal_changes_nothing_and_finds_unknown_losses(data):
     model.rehearse(data.example())
     assert model.training and torch.equal(generator, torch.get_rng_state())
     assert all(torch.equal(value, before[key]) for key, value in model.state_dict().items())
-    with pytest.raises(UserError, match="no loss is called 'comitment'.*did you mean 'commitment'"):
+    with pytest.raises(UserError, match=r"no loss is called 'comitment'.*did you mean 'commitment'"):
         module(data.spec, loss_weights={"comitment": 1.0}).rehearse(data.example())
 
 
