@@ -21,7 +21,8 @@ from repdib_lightning.evaluation.linear import LinearMap
 
 WIDTH, LAYERS, RATE, DECAY = 256, 2, 1e-3, 0.1
 LARGEST_BATCH, SMALLEST_BATCH, STEPS_AN_EPOCH = 256, 32, 8
-MAX_EPOCHS, PATIENCE, LEAST_GAIN = 40, 8, 0.01
+MAX_EPOCHS, PATIENCE, LEAST_GAIN = 25, 5, 0.01
+AGREEMENT = 2.0
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,8 @@ def fit_correction(whole: Task, folds: Sequence[Fold], seed: int) -> CorrectedMa
     """Learn what to add to a linear map: two hidden layers of 256 units, AdamW, early stopping over all folds at once.
 
     The last layer starts at zero, so that epoch 0 is the linear map itself, and it stays that where no later epoch
-    lowers the error summed over the folds. The epochs that lowered it most are repeated on all rows.
+    lowers the error of the folds by more than the folds differ (two standard errors). The epochs that lowered it most
+    are repeated on all rows.
 
     Args:
         whole: all rows.
@@ -130,19 +132,33 @@ class _Trainer:
 
 
 def _best_epoch(folds: Sequence[Fold], seed: int) -> int:
-    """The epoch of the lowest error over all folds, 0 included; ends when PATIENCE epochs gain next to nothing."""
+    """The epoch of the lowest error over all folds, or 0 where the folds do not agree that it is a gain.
+
+    Training ends when PATIENCE epochs gain next to nothing.
+    """
     trainers = [_Trainer(fold.task, seed) for fold in folds]
-    linear = [fold.task.base(fold.held_out) for fold in folds]
-    best, best_epoch = sum(fold.error(start) for fold, start in zip(folds, linear, strict=True)), 0
+    linear = np.array([fold.error(fold.task.base(fold.held_out)) for fold in folds])
+    best, best_epoch = linear, 0
     for epoch in range(1, MAX_EPOCHS + 1):
-        if best == 0.0:
+        if best.sum() == 0.0:
             break
-        total = 0.0
-        for fold, trainer, start in zip(folds, trainers, linear, strict=True):
+        for trainer in trainers:
             trainer.epoch()
-            total += fold.error(CorrectedMap(fold.task.base, trainer.network, epoch)(fold.held_out))
-        if total < best * (1.0 - LEAST_GAIN):
-            best, best_epoch = total, epoch
+        errors = np.array([_held_out_error(fold, trainer) for fold, trainer in zip(folds, trainers, strict=True)])
+        if errors.sum() < best.sum() * (1.0 - LEAST_GAIN):
+            best, best_epoch = errors, epoch
         elif epoch - best_epoch >= PATIENCE:
             break
-    return best_epoch
+    return best_epoch if _agreed(linear - best) else 0
+
+
+def _held_out_error(fold: Fold, trainer: _Trainer) -> float:
+    with torch.no_grad():
+        added = trainer.network(torch.from_numpy(np.asarray(fold.held_out, np.float32))).double().numpy()
+    return fold.error(fold.task.base(fold.held_out) + added)
+
+
+def _agreed(gains: np.ndarray) -> bool:
+    """Whether the mean gain of the folds exceeds AGREEMENT standard errors, so that no single episode decides."""
+    error = gains.std(ddof=1) / math.sqrt(len(gains)) if len(gains) > 1 else 0.0
+    return bool(gains.mean() > AGREEMENT * error)

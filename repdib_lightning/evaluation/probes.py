@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -28,6 +28,8 @@ ABSENT = -1e4
 """A logit so low that its class is never predicted, and small enough for float32."""
 
 Predict = Callable[[np.ndarray], np.ndarray]
+Fitted = tuple[float, LinearMap, list[LinearMap]]
+"""The chosen penalty, the fit on all rows, and the fit on the rows that each fold leaves."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,11 @@ class Half:
     target: np.ndarray
     episodes: np.ndarray
 
+    @cached_property
+    def linear(self) -> LinearProbe:
+        """The linear probe of this half; kept, because the non-linear one starts from it."""
+        return _fit_linear(self)
+
 
 @dataclass(frozen=True)
 class ProbeScore:
@@ -47,7 +54,7 @@ class ProbeScore:
         score: accuracy, or R2 (mean over dimensions); None where the factor does not vary in the score half.
         raw_kept: (score - chance) / (1 - chance), unclipped; None where chance is already perfect.
         kept: ``raw_kept`` clipped to [0, 1].
-        choice: what the inner split of the fit half chose (penalty; for ``mlp`` also epochs, where 0 is the linear probe).
+        choice: what the inner split of the fit half chose (penalty; for ``mlp`` also epochs, 0 being the linear probe).
     """
 
     score: float | None
@@ -104,8 +111,8 @@ def measure(probe: str, fit: Half, score: Half, seed: int) -> ProbeScore:
     A class that occurs only in the score half cannot be predicted, so its rows count as wrong.
     """
     with _one_thread():
-        predict, choice = _predictor(probe, fit, seed)
-        predicted = predict(score.features)
+        mapping, choice = _mapping(probe, fit, seed)
+        predicted = fit.linear.decode(mapping(score.features))
     if fit.target.ndim == 1:
         value: float | None = float(np.mean(predicted == score.target))
     else:
@@ -141,42 +148,49 @@ def explained(predicted: np.ndarray, target: np.ndarray) -> float | None:
 
 
 @dataclass(frozen=True)
-class _Linear:
-    """A linear probe: the penalty that the inner folds chose, its fit on all rows, and one without each fold."""
+class LinearProbe:
+    """A linear probe in the units it was fitted in.
 
+    Attributes:
+        target: (n,) classes as indices in [0, K), or (n, K) standardised values.
+        decode: (n, K) logits or standardised predictions to classes (n,) or values (n, K) as stored.
+        penalty: chosen by the inner folds.
+        whole: fitted on all rows.
+        without: fitted with this penalty on the rows that each fold leaves.
+    """
+
+    target: np.ndarray
+    decode: Predict
     penalty: float
     whole: LinearMap
     without: list[LinearMap]
 
 
-def _predictor(probe: str, fit: Half, seed: int) -> tuple[Predict, dict[str, float]]:
-    """Fit a probe; predictions are classes (n,), or values (n, K) in the target's own units."""
+def _fit_linear(fit: Half) -> LinearProbe:
     folds = episode_folds(fit.episodes)
     if fit.target.ndim == 1:
-        classes, target = np.unique(fit.target, return_inverse=True)
-        linear = _best_logistic(fit.features, target, folds)
-        mapped, choice = _corrected(linear, fit.features, target, folds, seed) if probe == "mlp" else _plain(linear)
-        return (lambda features: classes[mapped(features).argmax(1)]), choice
+        classes, index = np.unique(fit.target, return_inverse=True)
+        return LinearProbe(index, lambda logits: classes[logits.argmax(1)], *_best_logistic(fit.features, index, folds))
     mean, scale = _moments(fit.target)
     target = (fit.target - mean) / scale
-    linear = _best_ridge(fit.features, target, folds)
-    mapped, choice = _corrected(linear, fit.features, target, folds, seed) if probe == "mlp" else _plain(linear)
-    return (lambda features: mapped(features) * scale + mean), choice
+    return LinearProbe(target, lambda values: values * scale + mean, *_best_ridge(fit.features, target, folds))
 
 
-def _plain(linear: _Linear) -> tuple[Predict, dict[str, float]]:
-    return linear.whole, {"penalty": linear.penalty}
-
-
-def _corrected(
-    linear: _Linear, features: np.ndarray, target: np.ndarray, folds: list[np.ndarray], seed: int
-) -> tuple[Predict, dict[str, float]]:
+def _mapping(probe: str, fit: Half, seed: int) -> tuple[Predict, dict[str, float]]:
+    """(n, M) features to what ``LinearProbe.decode`` takes, and what the inner folds chose."""
+    linear = fit.linear
+    if probe == "linear":
+        return linear.whole, {"penalty": linear.penalty}
     parts = [
-        Fold(Task(features[~rows], target[~rows], base), features[rows], partial(_error, target=target[rows]))
-        for rows, base in zip(folds, linear.without, strict=True)
+        Fold(
+            Task(fit.features[~rows], linear.target[~rows], base),
+            fit.features[rows],
+            partial(_error, target=linear.target[rows]),
+        )
+        for rows, base in zip(episode_folds(fit.episodes), linear.without, strict=True)
     ]
-    mapped = fit_correction(Task(features, target, linear.whole), parts, seed)
-    return mapped, {"penalty": linear.penalty, "epochs": mapped.epochs}
+    corrected = fit_correction(Task(fit.features, linear.target, linear.whole), parts, seed)
+    return corrected, {"penalty": linear.penalty, "epochs": corrected.epochs}
 
 
 def _error(predicted: np.ndarray, target: np.ndarray) -> float:
@@ -185,7 +199,7 @@ def _error(predicted: np.ndarray, target: np.ndarray) -> float:
     return float(wrong.sum())
 
 
-def _best_logistic(features: np.ndarray, index: np.ndarray, folds: list[np.ndarray]) -> _Linear:
+def _best_logistic(features: np.ndarray, index: np.ndarray, folds: list[np.ndarray]) -> Fitted:
     """Logistic regression; the penalty with the best accuracy over the inner folds, the strongest of equals.
 
     Args:
@@ -204,7 +218,7 @@ def _best_logistic(features: np.ndarray, index: np.ndarray, folds: list[np.ndarr
     best = int(np.argmin(wrong))
     final = _LogisticPath(features, index)
     whole = [final.next(penalty, classes) for penalty in PENALTIES[: best + 1]][-1]
-    return _Linear(PENALTIES[best], whole, without[best])
+    return PENALTIES[best], whole, without[best]
 
 
 class _LogisticPath:
@@ -227,7 +241,7 @@ def _widened(narrow: LinearMap, present: np.ndarray, classes: int) -> LinearMap:
     return LinearMap(weight, bias)
 
 
-def _best_ridge(features: np.ndarray, target: np.ndarray, folds: list[np.ndarray]) -> _Linear:
+def _best_ridge(features: np.ndarray, target: np.ndarray, folds: list[np.ndarray]) -> Fitted:
     """Ridge regression; the penalty with the smallest squared error over the inner folds, the strongest of equals.
 
     Args:
@@ -239,7 +253,7 @@ def _best_ridge(features: np.ndarray, target: np.ndarray, folds: list[np.ndarray
         for penalty in RIDGE_PENALTIES
     ]
     penalty = RIDGE_PENALTIES[int(np.argmin(errors))]
-    return _Linear(penalty, Ridge(features, target).solve(penalty), [ridge.solve(penalty) for ridge in ridges])
+    return penalty, Ridge(features, target).solve(penalty), [ridge.solve(penalty) for ridge in ridges]
 
 
 def _moments(target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,11 +4,14 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from scipy.optimize import minimize
 
 from repdib_lightning.evaluation.codes import mutual_information
 from repdib_lightning.evaluation.linear import Ridge, fit_logistic
-from repdib_lightning.evaluation.probes import explained
+from repdib_lightning.evaluation.mlp import Fold, Task, build_mlp, fit_correction
+from repdib_lightning.evaluation.probes import Half, explained, measure
+from repdib_lightning.evaluation.splits import episode_folds
 
 
 def logistic_loss(flat, features, labels, classes, penalty):
@@ -86,3 +89,53 @@ def test_r2_is_one_minus_residual_over_total():
     residual = sum((t - p) ** 2 for t, p in zip(target[:, 0], predicted[:, 0], strict=True))
     mean = sum(target[:, 0]) / 30
     assert explained(predicted, target) == pytest.approx(1 - residual / sum((t - mean) ** 2 for t in target[:, 0]))
+
+
+def test_before_the_first_epoch_the_mlp_is_exactly_the_linear_probe(table):
+    features, labels = table
+    network = build_mlp(2, 3, torch.Generator().manual_seed(0))
+    assert torch.count_nonzero(network(torch.from_numpy(features).float())) == 0
+    base = fit_logistic(features, labels, 3, 1e-2)
+    errors = []
+
+    def grows(predicted):
+        errors.append(predicted)
+        return float(len(errors))
+
+    task = Task(features, labels, base)
+    fitted = fit_correction(task, [Fold(task, features, grows)], seed=0)
+    assert fitted.epochs == 0
+    np.testing.assert_array_equal(fitted(features), base(features))
+    np.testing.assert_array_equal(errors[0], base(features))
+    assert np.abs(errors[1] - base(features)).max() > 0
+
+
+@pytest.mark.parametrize("classes", [True, False])
+def test_the_linear_start_of_a_fold_is_fitted_without_its_episodes(classes):
+    generator = np.random.default_rng(5)
+    features, episodes = generator.normal(size=(120, 3)), np.repeat(np.arange(6), 20)
+    values = features @ generator.normal(size=(3, 2)) + generator.normal(size=(120, 2))
+    # Class 9 occurs in the first fold alone, so that fold's start has to do without it.
+    target = np.where(episodes == 0, 9, (values[:, 0] > 0) * 4) if classes else values
+    linear = Half(features, target, episodes).linear
+    for rows, start in zip(episode_folds(episodes), linear.without, strict=True):
+        if not classes:
+            expected = Ridge(features[~rows], linear.target[~rows]).solve(linear.penalty)(features)
+            np.testing.assert_allclose(start(features), expected, atol=1e-10)
+            continue
+        present, index = np.unique(target[~rows], return_inverse=True)
+        expected = fit_logistic(features[~rows], index, len(present), linear.penalty)(features)
+        columns = np.searchsorted([0, 4, 9], present)
+        np.testing.assert_allclose(start(features)[:, columns], expected, atol=1e-2)
+        assert set(start(features).argmax(1)) <= set(columns)
+
+
+def test_where_no_epoch_helps_both_probes_score_alike():
+    generator = np.random.default_rng(6)
+    features, episodes = generator.normal(size=(160, 4)), np.repeat(np.arange(8), 20)
+    target = features @ generator.normal(size=(4, 1))
+    even = episodes % 2 == 0
+    fit, score = (Half(features[part], target[part], episodes[part]) for part in (even, ~even))
+    linear, mlp = (measure(probe, fit, score, 0) for probe in ("linear", "mlp"))
+    assert mlp.choice == {"penalty": linear.choice["penalty"], "epochs": 0}
+    assert mlp.score == linear.score

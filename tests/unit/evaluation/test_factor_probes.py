@@ -71,6 +71,40 @@ def test_the_mlp_reads_what_no_linear_probe_can():
     assert measure("mlp", fit, score, 0).kept > 0.8
 
 
+def test_the_mlp_reads_the_size_of_a_value_whose_sign_alone_is_linear():
+    features = np.random.default_rng(1).normal(size=(800, 4))
+    target = np.stack([np.abs(features[:, 0]), features[:, 1]], axis=1)
+    fit, score = halves(features, target, np.repeat(np.arange(8), 100))
+    assert measure("linear", fit, score, 0).kept < 0.6
+    assert measure("mlp", fit, score, 0).kept > 0.93
+
+
+def drifting_episodes(seed, episodes=8, length=60, features=32):
+    """Few episodes of near copies: slow paths of eight sources, mixed linearly, plus an offset of each episode."""
+    generator = np.random.default_rng(seed)
+    group = np.repeat(np.arange(episodes), length)
+    sources = np.concatenate([_slow(generator.normal(size=(length, 8))) for _ in range(episodes)])
+    offsets = generator.normal(size=(episodes, features))[group]
+    mixed = sources @ generator.normal(size=(8, features)) / np.sqrt(8.0)
+    seen = mixed + 0.6 * offsets + 0.1 * generator.normal(size=mixed.shape)
+    return seen, sources, group
+
+
+def _slow(steps):
+    path = np.cumsum(steps, axis=0)
+    return (path - path.mean(0)) / path.std(0)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_mlp_reads_no_less_than_the_linear_probe_where_few_episodes_drift(seed):
+    features, sources, episodes = drifting_episodes(seed)
+    for target in (sources[:, :2], np.digitize(sources[:, 0], [-0.8, 0.0, 0.8])):
+        fit, score = _standardised(*halves(features, target, episodes))
+        linear, mlp = (measure(probe, fit, score, 0).score for probe in PROBES)
+        assert linear > 0.5
+        assert mlp > linear - 0.03
+
+
 def test_class_numbers_need_not_be_dense_and_unseen_classes_count_as_wrong():
     generator = np.random.default_rng(0)
     label = generator.choice([3, 70], size=400)
@@ -140,12 +174,20 @@ def test_a_probe_neither_reads_nor_moves_the_global_random_state():
     assert torch.equal(torch.get_rng_state(), before)
 
 
+def test_the_seed_moves_the_score_where_a_correction_is_learned():
+    features = np.random.default_rng(0).normal(size=(400, 2))
+    fit, score = halves(features, np.abs(features[:, :1]), np.repeat(np.arange(8), 50))
+    first, again, other = (measure("mlp", fit, score, seed) for seed in (0, 0, 1))
+    assert first == again and first.choice["epochs"] > 0
+    assert other.score != first.score
+
+
 def test_seeds_change_the_network_and_early_stopping_ends_before_it_learns_noise_by_heart():
     first, same, other = (build_mlp(3, 2, torch.Generator().manual_seed(seed))[0].weight.detach() for seed in (0, 0, 1))
     assert torch.equal(first, same) and not torch.equal(first, other)
     generator = np.random.default_rng(0)
     fit, score = halves(generator.normal(size=(600, 20)), generator.integers(2, size=600), np.repeat(np.arange(8), 75))
-    assert measure("mlp", fit, score, 0).choice["epochs"] <= 15
+    assert measure("mlp", fit, score, 0).choice["epochs"] <= 5
 
 
 def test_an_unknown_probe_names_the_nearest():
