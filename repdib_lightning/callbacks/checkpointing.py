@@ -80,8 +80,6 @@ class RunCheckpoint(Checkpoint):
         step = trainer.global_step
         if step == self._saved_step or not self.exact_resume.progress.between_steps(trainer):
             return
-        for logger in trainer.loggers:
-            logger.save()
         path = step_path(self.folder, step)
         trainer.save_checkpoint(path, weights_only=False)
         self.newest, self._saved_step = path, step

@@ -165,6 +165,16 @@ def test_sigterm_in_a_validation_goes_back_to_the_last_checkpoint(process: Any, 
     assert_same(run, unbroken("epochs"))
 
 
+def test_sigterm_with_half_a_step_accumulated_saves_nothing(process: Any, unbroken: Any, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert process(run, stop=8, how="term", every=3, **RUNS["accumulated"]) == 143
+    assert checkpoints(run)[-1] == "step-00000003.ckpt"  # steps are made after 2, 4, 5 (the epoch's end), 7, 9 batches
+    assert process(run, stop=9, how="term", resume=True, every=100, **RUNS["accumulated"]) == 143
+    assert checkpoints(run)[-1] == "step-00000005.ckpt"
+    assert process(run, resume=True, **RUNS["accumulated"]) == 0
+    assert_same(run, unbroken("accumulated"))
+
+
 def test_the_keyboard_interrupts_without_saving_half_a_step(process: Any, unbroken: Any, tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert process(run, stop=7, how="interrupt", every=5, **RUNS["epochs"]) == 130
