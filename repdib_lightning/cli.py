@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shlex
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,9 +13,11 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
+from jsonargparse import Namespace
 from jsonargparse.typing import PositiveInt
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from repdib_lightning import configurations, run_folder
@@ -32,6 +35,7 @@ from repdib_lightning.export.run_export import write_model_description
 from repdib_lightning.objectives import OBJECTIVES
 from repdib_lightning.option_errors import one_line
 from repdib_lightning.representation import RepresentationModule
+from repdib_lightning.resuming import check_idle, check_same_data, check_unchanged
 
 DEFAULT = "robot_arm"
 SLOTS: dict[str, list[str]] = {
@@ -73,6 +77,9 @@ class TrainingCLI(LightningCLI):
         """Parse; bad input becomes one line."""
         with _one_line_errors(parser):
             super().parse_arguments(parser, args)
+        seed = self.config.seed_everything
+        if not isinstance(seed, bool) and not 0 <= seed < 2**32:
+            raise UserError(f"seed_everything must be in 0..{2**32 - 1}, is {seed}")
 
     def instantiate_classes(self) -> None:
         """Build data module, model and trainer; a constructor's complaint becomes one line."""
@@ -81,13 +88,17 @@ class TrainingCLI(LightningCLI):
 
     def instantiate_trainer(self, **kwargs: Any) -> pl.Trainer:
         """Give the trainer the loggers, callbacks and plugins of the run's folder."""
-        config = self.config
+        config, given = self.config, self.config_init.trainer
+        _refuse(config)
         self.folder = Path(config.resume or config.run or run_folder.default_folder(self._file_names()))
         self.checkpoint = last_good(self.folder) if config.resume else None
-        step = step_of(self.checkpoint) if self.checkpoint else None
-        board = TensorBoardLogger(self.folder.parent, name=self.folder.name, version="", purge_step=step)
-        kwargs |= {"logger": [board, MetricsCSV(self.folder, step)], "default_root_dir": str(self.folder)}
-        kwargs["plugins"] = [*(self.config_init.trainer.plugins or []), *run_plugins()]
+        self.first_step = step_of(self.checkpoint) if self.checkpoint else 0
+        if given.logger in (None, True):
+            purge = self.first_step if self.checkpoint else None
+            board = TensorBoardLogger(self.folder.parent, name=self.folder.name, version="", purge_step=purge)
+            kwargs["logger"] = [board, MetricsCSV(self.folder, purge)]
+        kwargs |= {"default_root_dir": str(self.folder), "plugins": [*(given.plugins or []), *run_plugins()]}
+        kwargs["use_distributed_sampler"] = False  # the loaders give each process its own share
         safety = run_callbacks(self.folder, config.checkpoint_every, config.checkpoint_keep)
         self.trainer_defaults = {"callbacks": [Pictures(), CodebookUse(), *safety]}
         return super().instantiate_trainer(**kwargs)
@@ -106,19 +117,74 @@ class TrainingCLI(LightningCLI):
 def fit(arguments: list[str]) -> int:
     """Train a new run, or go on with one."""
     cli = _prepare(_with_run("--resume", arguments))
-    resumed = cli.checkpoint is not None
+    limit = cli.trainer.max_steps
+    if cli.checkpoint is not None and 0 <= limit <= cli.first_step:
+        print(f"{cli.folder}: is at step {cli.first_step} already; to go on, give a --trainer.max_steps above it")
+        return 0
+    _open(cli)
+    _say(f"run folder: {cli.folder}")
+    try:
+        with exit_codes(), _one_line_errors(cli.parser, _SETUP_ERRORS):
+            cli.trainer.fit(cli.model, datamodule=cli.datamodule, ckpt_path=cli.checkpoint)
+    except ValueError as error:
+        if isinstance(error, UserError) or cli.trainer.global_step > cli.first_step:
+            raise
+        raise UserError(str(error)) from error  # options that do not fit the data, such as validation intervals
+    except SystemExit:
+        _say(f"stopped: {cli.folder}    go on: python -m repdib_lightning fit --resume {shlex.quote(str(cli.folder))}")
+        raise
+    finally:
+        run_folder.remove_stillborn(cli.folder)
+    _say(f"finished: {cli.folder}    next: python -m repdib_lightning export {shlex.quote(str(cli.folder))}")
+    return 0
+
+
+def _open(cli: TrainingCLI) -> None:
+    """Try everything that can go wrong with data, model and options, then make the run's folder or go on in it."""
+    resumed, configuration = cli.checkpoint is not None, cli.configuration()
     run_folder.check_new(cli.folder, exist_ok=resumed)
-    cli.datamodule.prepare_data()
+    if resumed:
+        check_idle(cli.folder)
+        check_unchanged(cli.folder, (cli.folder / run_folder.CONFIGURATION).read_text(), configuration)
+    else:
+        cli.datamodule.prepare_data()
     cli.datamodule.setup("fit")
-    cli.model.build(cli.datamodule.spec).rehearse(cli.datamodule.example())
-    run_folder.open_run(cli.folder, cli.configuration(), cli.datamodule.store, resumed=resumed)
+    if resumed:
+        check_same_data(cli.folder, cli.datamodule.store)
+    cli.datamodule.train_dataloader()
+    with _one_line_errors(cli.parser):
+        cli.model.build(cli.datamodule.spec).rehearse(cli.datamodule.example())
+        cli.model.configure_optimizers()
+    run_folder.open_run(cli.folder, configuration, cli.datamodule.store, resumed=resumed)
     if not resumed:
         _describe_model(cli)
-    print(f"run folder: {cli.folder}", flush=True)
-    with exit_codes():
-        cli.trainer.fit(cli.model, datamodule=cli.datamodule, ckpt_path=cli.checkpoint)
-    print(f"finished: {cli.folder}    next: python -m repdib_lightning export {cli.folder}", flush=True)
-    return 0
+
+
+@rank_zero_only
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+def _refuse(config: Namespace) -> None:
+    """Trainer options that this command line cannot honour. Raises UserError saying what to do instead."""
+    trainer = config.trainer
+    if config.run is not None and not config.run.strip():
+        raise UserError("--run: needs the name of a folder")
+    if config.run is not None and config.resume is not None:
+        raise UserError("--resume goes on in the run's own folder: leave out --run")
+    if trainer.fast_dev_run:
+        raise UserError("trainer.fast_dev_run leaves no run behind; for a run of seconds use --config debug")
+    if trainer.default_root_dir is not None:
+        raise UserError("trainer.default_root_dir: name the run's folder with --run")
+    if trainer.overfit_batches or trainer.reload_dataloaders_every_n_epochs:
+        raise UserError("trainer.overfit_batches and reload_dataloaders_every_n_epochs do not fit an exact data stream")
+    for key in ("max_steps", "max_epochs", "limit_train_batches"):
+        if trainer[key] == 0:
+            raise UserError(f"trainer.{key} is 0: no step would be trained")
+    if trainer.enable_checkpointing is False:
+        raise UserError(
+            "trainer.enable_checkpointing: a run keeps checkpoints; make them rarer with --checkpoint_every"
+        )
 
 
 @rank_zero_only
@@ -148,8 +214,10 @@ def _evaluate(verb: str, arguments: list[str]) -> int:
     cli = _prepare(_with_run("--resume", arguments))
     cli.datamodule.setup(verb)
     cli.model.build(cli.datamodule.spec)
-    trainer = pl.Trainer(logger=False, enable_checkpointing=False, enable_model_summary=False, plugins=run_plugins())
-    getattr(trainer, verb)(cli.model, datamodule=cli.datamodule, ckpt_path=cli.checkpoint)
+    plain = {"logger": False, "callbacks": None, "plugins": run_plugins(), "use_distributed_sampler": False}
+    trainer = pl.Trainer(**{**cli.config_init.trainer, **plain, "enable_model_summary": False})
+    with _one_line_errors(cli.parser, (RuntimeError, *_SETUP_ERRORS)):
+        getattr(trainer, verb)(cli.model, datamodule=cli.datamodule, ckpt_path=cli.checkpoint)
     return 0
 
 
@@ -189,12 +257,27 @@ def _with_run(option: str, arguments: list[str]) -> list[str]:
     return arguments
 
 
+_PARSING_ERRORS = (
+    argparse.ArgumentError,
+    ValueError,
+    TypeError,
+    ImportError,
+    AttributeError,
+    MisconfigurationException,
+)
+_SETUP_ERRORS = (MisconfigurationException,)
+"""What Lightning raises where trainer options do not fit each other or this machine."""
+
+
 @contextmanager
-def _one_line_errors(parser: LightningArgumentParser) -> Iterator[None]:
+def _one_line_errors(
+    parser: LightningArgumentParser, kinds: tuple[type[Exception], ...] = _PARSING_ERRORS
+) -> Iterator[None]:
+    """Turn errors of these kinds into one line."""
     try:
         yield
     except UserError:
         raise
-    except (argparse.ArgumentError, ValueError, TypeError, ImportError, AttributeError) as error:
+    except kinds as error:
         options = [option[2:] for action in parser._actions for option in action.option_strings if option[:2] == "--"]
         raise one_line(error, options, SLOTS) from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import shutil
 import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -35,6 +36,15 @@ def open_run(folder: Path, configuration: str, store: EpisodeStore, *, resumed: 
         facts = {"versions": versions(), "data": {"file": store.path.name, "fingerprint": store.fingerprint}}
         with whole_file(folder / "environment.json") as path:
             path.write_text(json.dumps(facts, indent=1) + "\n")
+
+
+@rank_zero_only
+def remove_stillborn(folder: Path) -> None:
+    """Remove a run that ended before its first checkpoint: it cannot go on, and would only block its name."""
+    if (folder / CONFIGURATION).is_file() and not list(folder.glob("checkpoints/*.ckpt")):
+        shutil.rmtree(folder)
+        if folder.parent == Path("runs") and not any(folder.parent.iterdir()):
+            folder.parent.rmdir()
 
 
 def default_folder(configurations: list[str]) -> Path:

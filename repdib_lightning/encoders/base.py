@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from repdib_lightning.arguments import RememberedArguments
+from repdib_lightning.errors import UserError
 from repdib_lightning.records import DataSpec
 
 
@@ -14,12 +15,14 @@ class Encoder(RememberedArguments):
     Subclasses are built as ``Encoder(spec, *, features=..., ...)``; every size is measured from the spec.
 
     Attributes:
-        spec: the observations it takes.
+        spec: the observations it takes (those of the data that it uses).
         features: M, the width of what it returns.
     """
 
     def __init__(self, spec: DataSpec, features: int) -> None:
         super().__init__()
+        if features < 1:
+            raise UserError(f"{type(self).__name__}: features must be at least 1, is {features}")
         self.spec = spec
         self.features = features
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from repdib_lightning.encoders.base import Encoder
-from repdib_lightning.encoders.views import centred, image_views
+from repdib_lightning.encoders.views import centred, image_views, seen_only
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import DataSpec
 
@@ -38,13 +38,17 @@ class ConvolutionalEncoder(Encoder):
         strides: list[int] | None = None,
         views: list[str] | None = None,
     ) -> None:
-        super().__init__(spec, features)
-        self.views = image_views(spec, views, "ConvolutionalEncoder")
+        views = image_views(spec, views, "ConvolutionalEncoder")
+        super().__init__(seen_only(spec, views), features)
+        self.views = views
+        strides = [2, 1, 1, 1] if strides is None else strides
+        if channels < 1 or not strides or min(strides) < 1:
+            raise UserError(f"ConvolutionalEncoder: channels ({channels}) and strides ({strides}) must be at least 1")
         self.stacks = nn.ModuleDict()
         width = 0
         for view in self.views:
             shape = spec.observations[view].shape
-            stack = convolution_stack(shape[0], channels, strides or [2, 1, 1, 1])
+            stack = convolution_stack(shape[0], channels, strides)
             self.stacks[view] = stack
             width += flat_width(stack, view, shape)
         self.trunk = nn.Sequential(nn.Linear(width, features), nn.LayerNorm(features), nn.Tanh())

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from repdib_lightning.encoders.base import Encoder
-from repdib_lightning.encoders.views import centred, image_views
+from repdib_lightning.encoders.views import centred, image_views, seen_only
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.records import DataSpec
 
@@ -40,14 +40,15 @@ class ResNetEncoder(Encoder):
     ) -> None:
         import torchvision  # a second of import that only this encoder needs
 
-        super().__init__(spec, features)
+        views = image_views(spec, views, "ResNetEncoder")
+        super().__init__(seen_only(spec, views), features)
+        self.views = views
         if architecture not in _ARCHITECTURES:
             raise UserError(
                 f"ResNetEncoder: unknown architecture '{architecture}' {nearest(architecture, _ARCHITECTURES)}"
             )
         if norm not in ("batch", "group"):
             raise UserError(f"ResNetEncoder: unknown norm '{norm}' {nearest(norm, ('batch', 'group'))}")
-        self.views = image_views(spec, views, "ResNetEncoder")
         self.networks = nn.ModuleDict()
         width = 0
         for view in self.views:

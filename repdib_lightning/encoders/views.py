@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.records import DataSpec
@@ -21,8 +23,16 @@ def image_views(spec: DataSpec, views: list[str] | None, owner: str) -> list[str
             raise UserError(f"{owner}: views has '{name}', which is no picture in the data {nearest(name, images)}")
     chosen = views if views is not None else images
     if not chosen:
-        raise UserError(f"{owner}: needs a picture (C, H, W), the data has {sorted(spec.observations)}")
+        raise UserError(f"{owner}: needs at least one picture (C, H, W); pictures in the data: {images or 'none'}")
+    for name in chosen:
+        if "." in name or hasattr(nn.ModuleDict, name):
+            raise UserError(f"{owner}: an observation cannot be called '{name}'; rename it in the data")
     return list(chosen)
+
+
+def seen_only(spec: DataSpec, views: list[str]) -> DataSpec:
+    """The spec of an encoder that uses some of the observations: what a bundle will ask for."""
+    return replace(spec, observations={name: spec.observations[name] for name in views})
 
 
 def centred(image: Tensor) -> Tensor:

@@ -61,6 +61,18 @@ def fit(*options: str) -> list[str]:
         (fit("--data.init_args.views", "[frnt]"), "small.h5: has no observation 'frnt' did you mean 'front'?"),
         (fit("--data.horizon", "30"), "episode 0 has 12 steps, fewer than the horizon 30"),
         (fit("--checkpoint_every", "0"), "checkpoint_every"),
+        (fit("--data.batch_size", "1000"), "batch_size is 1000, the data has"),
+        (fit("--model.optimizer.lr", "-1"), "Invalid learning rate"),
+        (fit("--model.encoder.strides", "[0]"), "strides ([0]) must be at least 1"),
+        (fit("--model.encoder.views", "[]"), "needs at least one picture"),
+        (fit("--seed_everything", "-1"), "seed_everything"),
+        (fit("--trainer.accelerator", "gpu"), "No supported gpu backend found"),
+        (fit("--trainer.max_steps", "0"), "trainer.max_steps is 0: no step would be trained"),
+        (fit("--trainer.fast_dev_run", "true"), "use --config debug"),
+        (fit("--trainer.default_root_dir", "x"), "--run"),
+        (fit("--trainer.overfit_batches", "2"), "overfit_batches"),
+        (fit("--trainer.check_val_every_n_epoch", "1", "--trainer.val_check_interval", "900"), "val_check_interval"),
+        (fit("--run", ""), "--run: needs the name of a folder"),
         (["fit", "--resume", "runs/none"], "runs/none: no such run"),
         (["fit", "--resume"], "--resume: needs the folder of a run"),
         (["validate"], "validate: needs the folder of a run"),
@@ -150,6 +162,41 @@ def test_checkpoints(copy, capsys):
     for path in newest:
         path.unlink()
     assert "runs/a" in complaint(capsys, "validate", "runs/a")
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        (["--data.batch_size", "16"], "data.init_args.batch_size was 8 and is 16 now"),
+        (["--model.bottleneck.init_args.groups", "16"], "groups was 8 and is 16 now"),
+        (["--model.optimizer.init_args.lr", "0.5"], "lr was 0.001 and is 0.5 now"),
+        (["--seed_everything", "7"], "seed_everything was 0 and is 7 now"),
+        (["--data.path", "other.h5"], "other.h5 holds other data"),
+        (["--run", "runs/b"], "leave out --run"),
+    ],
+)
+def test_a_run_keeps_its_model_and_data(copy, capsys, make_store, options, wanted):
+    make_store(Path("other.h5"), seed=9)
+    assert wanted in complaint(capsys, "fit", "--resume", "runs/a", "--trainer.max_steps", "9", *options)
+    assert main(["fit", "--resume", "runs/a", "--trainer.max_steps", "6"]) == 0, "the run is as good as before"
+
+
+def test_a_finished_run_has_nothing_to_resume(copy, capsys):
+    before = tree(Path())
+    assert main(["fit", "--resume", "runs/a"]) == 0
+    assert "is at step 4 already" in capsys.readouterr().out and tree(Path()) == before
+
+
+def test_a_run_in_training_is_not_resumed_twice(copy, capsys):
+    from repdib_lightning.callbacks.status_file import Status
+
+    Status.of_this_process().write(Path("runs/a"))
+    assert "is training this run" in complaint(capsys, "fit", "--resume", "runs/a", "--trainer.max_steps", "9")
+
+
+def test_a_resumed_run_does_not_collect_data(copy, capsys):
+    Path("small.h5").unlink()
+    assert "small.h5: no such data file" in complaint(capsys, "fit", "--resume", "runs/a", "--trainer.max_steps", "9")
 
 
 def test_bundles(copy, capsys, make_store):

@@ -59,7 +59,7 @@ def test_views_are_chosen_and_unknown_ones_named():
     assert torch.equal(encoder(inputs), encoder(changed))
     with pytest.raises(UserError, match=r"'tob'.*did you mean 'top'"):
         ConvolutionalEncoder(spec, views=["tob"])
-    with pytest.raises(UserError, match="needs a picture"):
+    with pytest.raises(UserError, match="needs at least one picture"):
         ConvolutionalEncoder(DataSpec({"joints": ArraySpec((7,), "float32")}))
 
 
