@@ -69,7 +69,7 @@ class CodebookUse(Callback):
         counts = histogram.compute()
         values = {f"val/perplexity/group_{g}": float(value) for g, value in enumerate(perplexity(counts))}
         values |= {f"val/used/group_{g}": float(value) for g, value in enumerate((counts > 0).sum(-1))}
-        pl_module.log_dict(values)
+        pl_module.log_dict(values, sync_dist=True)
         shares = counts.sort(-1, descending=True).values / counts.amax(-1, keepdim=True).clamp(min=1)
         for writer in tensorboards(trainer):
             writer.add_image("codes/use", shares[None], trainer.global_step)
