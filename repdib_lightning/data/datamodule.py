@@ -49,6 +49,8 @@ class EpisodeDataModule(pl.LightningDataModule):
                 raise UserError(f"data.{name} must be at least 1, is {getattr(self, name)}")
         if workers < 0 or seed < 0:
             raise UserError(f"data.workers and data.seed must not be negative, are {workers} and {seed}")
+        if views is not None and not views:
+            raise UserError("data.views is empty; name at least one observation, or leave the option out to use all")
         self.store: EpisodeStore | None = None
 
     def setup(self, stage: str | None = None) -> None:

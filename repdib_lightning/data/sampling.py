@@ -57,14 +57,10 @@ class FutureSampling:
             raise UserError(f"horizon ({horizon}) and futures ({futures}) must be at least 1")
         episodes = store.episodes(split)
         if not len(episodes):
-            raise UserError(f"{store.path}: has no episode for {split}")
+            raise UserError(_empty_split(store, split))
         short = episodes[store.lengths[episodes] <= horizon]
         if len(short):
-            steps = store.lengths[short[0]] - 1
-            raise UserError(
-                f"{store.path}: episode {short[0]} has {steps} steps, fewer than the horizon {horizon}; "
-                f"the largest valid horizon is {int(store.lengths[episodes].min()) - 1}"
-            )
+            raise UserError(_too_short(store, episodes, int(short[0]), horizon))
         spans = [np.arange(store.starts[e], store.starts[e] + store.lengths[e] - horizon) for e in episodes]
         self.anchors = np.concatenate(spans)
         self.horizon, self.futures, self.seed = horizon, futures, seed
@@ -99,3 +95,25 @@ class FutureSampling:
             self._order = generator.permutation(self.anchors)
             self._offsets = generator.integers(1, self.horizon + 1, (len(self), self.futures))
             self._epoch = epoch
+
+
+def _empty_split(store: EpisodeStore, split: Split) -> str:
+    if split == "evaluation":
+        hint = "mark some in `episodes/evaluation`, or have at least 5 episodes (every fifth is held out then)"
+    else:
+        hint = "all are marked in `episodes/evaluation`; leave some for training"
+    return f"{store.path}: has no episode for {split} ({len(store.lengths)} in all): {hint}"
+
+
+def _too_short(store: EpisodeStore, episodes: np.ndarray, short: int, horizon: int) -> str:
+    shortest = int(episodes[np.argmin(store.lengths[episodes])])
+    largest = int(store.lengths[shortest]) - 1
+    if largest == 0:
+        return (
+            f"{store.path}: episode {shortest} has one row and therefore no step, so that no horizon is valid; "
+            "leave this episode out when the file is written"
+        )
+    return (
+        f"{store.path}: episode {short} has {store.lengths[short] - 1} steps, fewer than the horizon {horizon}; "
+        f"the largest valid horizon is {largest}"
+    )

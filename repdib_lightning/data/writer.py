@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import glob
 import os
 from pathlib import Path
 from types import TracebackType
@@ -11,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from repdib_lightning.data.episode_checks import check_episode, check_stated, columns_of, flat, plain_attributes
 from repdib_lightning.data.files import sync_directory, sync_file
 from repdib_lightning.data.fingerprint import ContentHash
 from repdib_lightning.data.schema import FORMAT, SCHEMA_VERSION, FactorSpec
@@ -36,7 +37,8 @@ class EpisodeWriter:
         attributes: environment, generating configuration, seed, licence; plain values, nested ones become JSON.
 
     Raises:
-        UserError: the path exists, cannot be written, or the disk is full.
+        UserError: the path exists or is a folder, cannot be written, the disk is full, or what is stated cannot be a
+            store; on leaving: fewer rows or episodes than stated were added (no file appears then).
     """
 
     def __init__(
@@ -54,28 +56,32 @@ class EpisodeWriter:
         overwrite: bool = False,
     ) -> None:
         self.path = Path(path)
+        if self.path.is_dir():
+            raise UserError(f"{self.path}: is a folder; name a file, such as {self.path / 'NAME.h5'}")
         if self.path.exists() and not overwrite:
             raise UserError(f"{self.path}: exists already; choose another file or pass --overwrite")
+        factors, masks = factors or {}, masks or {}
+        check_stated(self.path, rows, episodes, observations, actions, factors, masks)
+        plain = plain_attributes(self.path, attributes or {})
         self.rows, self.episodes = rows, episodes
         self.observations, self.actions = observations, actions
+        self._columns = columns_of(observations, actions, factors, masks, rewards)
         self._row = self._episode = 0
         self._hash = ContentHash()
         self._temporary = self.path.with_name(f".{self.path.name}.tmp-{os.getpid()}")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
+            remove_leftovers(self.path)
             self._check_space(observations)
             self._file = h5py.File(self._temporary, "w")
         except OSError as error:
             raise self._cannot_write(error) from error
         try:
-            self._allocate(factors or {}, masks or {}, rewards)
-        except OSError as error:
+            self._allocate(factors, masks)
+            self._file.attrs.update({"format": FORMAT, "schema_version": SCHEMA_VERSION, **plain})
+        except (OSError, RuntimeError, ValueError) as error:  # HDF5's limits, such as 64 KiB an attribute
             self._discard()
             raise self._cannot_write(error) from error
-        self._file.attrs.update({"format": FORMAT, "schema_version": SCHEMA_VERSION})
-        for key, value in (attributes or {}).items():
-            plain = isinstance(value, (str, int, float, bool))
-            self._file.attrs[key] = value if plain else json.dumps(value, sort_keys=True)
 
     def _check_space(self, observations: dict[str, ArraySpec]) -> None:
         width = {"uint8": 1, "float32": 4}
@@ -85,8 +91,8 @@ class EpisodeWriter:
             free = status.f_bavail * status.f_frsize / 2**20
             raise UserError(f"{self.path}: cannot be written (needs {needed / 2**20:.0f} MiB, {free:.0f} MiB are free)")
 
-    def _cannot_write(self, error: OSError) -> UserError:
-        return UserError(f"{self.path}: cannot be written ({error.strerror or error})")
+    def _cannot_write(self, error: Exception) -> UserError:
+        return UserError(f"{self.path}: cannot be written ({getattr(error, 'strerror', None) or error})")
 
     def _dataset(self, name: str, shape: tuple[int, ...], dtype: str) -> h5py.Dataset:
         """A contiguous data set whose place in the file is fixed now, so that it can be memory-mapped."""
@@ -101,28 +107,18 @@ class EpisodeWriter:
         kind = h5py.h5t.py_create(np.dtype(dtype), logical=True)
         return h5py.Dataset(h5py.h5d.create(parent.id, leaf, kind, space, layout))
 
-    def _allocate(self, factors: dict[str, FactorSpec], masks: dict[str, tuple[int, int]], rewards: bool) -> None:
-        for name, spec in self.observations.items():
-            self._dataset(f"observations/{name}", (self.rows, *spec.shape), spec.dtype)
+    def _allocate(self, factors: dict[str, FactorSpec], masks: dict[str, tuple[int, int]]) -> None:
+        for name, column in self._columns.items():
+            self._dataset(name, (self.rows, *column.stored_shape), column.stored_dtype)
         if self.actions is not None:
-            discrete = self.actions.kind == "discrete"
-            shape = (self.rows,) if discrete else (self.rows, self.actions.size)
-            actions = self._dataset("actions", shape, "int64" if discrete else "float32")
-            actions.attrs.update({"kind": self.actions.kind, "size": self.actions.size})
-        if rewards:
-            self._dataset("rewards", (self.rows,), "float32")
-            self._dataset("terminations", (self.rows,), "bool")
-            self._dataset("truncations", (self.rows,), "bool")
+            self._file["actions"].attrs.update({"kind": self.actions.kind, "size": self.actions.size})
         for name, factor in factors.items():
-            categorical = factor.scale == "categorical"
-            shape = (self.rows,) if factor.width == 1 else (self.rows, factor.width)
-            values = self._dataset(f"factors/{name}", shape, "int64" if categorical else "float32")
-            values.attrs.update({"kind": factor.kind, "scale": factor.scale})
-            if categorical:
-                values.attrs["classes"] = factor.classes
-        for name, (height, width) in masks.items():
-            mask = self._dataset(f"masks/{name}", (self.rows, height, -(-width // 8)), "uint8")
-            mask.attrs["width"] = width
+            attributes = self._file[f"factors/{name}"].attrs
+            attributes.update({"kind": factor.kind, "scale": factor.scale})
+            if factor.scale == "categorical":
+                attributes["classes"] = factor.classes
+        for name, (_, width) in masks.items():
+            self._file[f"masks/{name}"].attrs["width"] = width
         for name in ("start", "length"):
             self._dataset(f"episodes/{name}", (self.episodes,), "int64")
         self._dataset("episodes/evaluation", (self.episodes,), "bool")
@@ -148,25 +144,28 @@ class EpisodeWriter:
             factors: name -> (T, ...).
             masks: observation name -> (T, H, W) bool.
             evaluation: the episode is never trained on.
+
+        Raises:
+            UserError: an array that was stated is missing, one was not stated, or shape, type or values are not as
+                stated (named with key and episode; nothing of the episode is written), the disk is full.
         """
-        length = len(next(iter(observations.values())))
+        where = f"{self.path}: episode {self._episode}"
+        if not self._file:
+            raise UserError(f"{where}: the writer is closed; add episodes inside its `with` block")
+        if not isinstance(evaluation, (bool, np.bool_)):
+            raise UserError(f"{where}: evaluation is {evaluation!r}; expected True or False")
+        groups = {"observations": observations, "factors": factors, "masks": masks}
+        single = {"actions": actions, "rewards": rewards, "terminations": terminations, "truncations": truncations}
+        arrays = check_episode(where, self._columns, flat(where, groups, single))
+        length = len(next(iter(arrays.values())))
         rows = slice(self._row, self._row + length)
-        assert rows.stop <= self.rows and self._episode < self.episodes, "more rows or episodes than stated"
-        arrays = {f"observations/{name}": array for name, array in observations.items()}
-        if actions is not None:
-            assert self.actions is not None
-            filler = -1 if self.actions.kind == "discrete" else 0
-            arrays["actions"] = _with_final_row(actions, filler)
-        outcome = {"rewards": rewards, "terminations": terminations, "truncations": truncations}
-        arrays |= {name: _with_final_row(array, 0) for name, array in outcome.items() if array is not None}
-        arrays |= {f"factors/{name}": array for name, array in (factors or {}).items()}
-        arrays |= {f"masks/{name}": np.packbits(array, axis=-1) for name, array in (masks or {}).items()}
+        if rows.stop > self.rows or self._episode >= self.episodes:
+            stated = f"the writer was made for {self.rows} rows in {self.episodes} episodes"
+            raise UserError(f"{where} ends at row {rows.stop}, but {stated}")
+        evaluation = bool(evaluation)
         try:
             for name, array in arrays.items():
-                dataset = self._file[name]
-                assert array.shape == (length, *dataset.shape[1:]), (name, array.shape, dataset.shape)
-                arrays[name] = np.ascontiguousarray(array, dtype=dataset.dtype)
-                dataset[rows] = arrays[name]
+                self._file[name][rows] = array
             self._hash.add_episode(arrays, evaluation=evaluation)
             self._file["episodes/start"][self._episode] = rows.start
             self._file["episodes/length"][self._episode] = length
@@ -193,8 +192,11 @@ class EpisodeWriter:
         self._temporary.unlink(missing_ok=True)
 
     def _publish(self) -> None:
-        filled = (self._row, self._episode)
-        assert filled == (self.rows, self.episodes), f"stated {self.rows, self.episodes}, wrote {filled}"
+        if (self._row, self._episode) != (self.rows, self.episodes):
+            raise UserError(
+                f"{self.path}: not written, {self._row} rows in {self._episode} episodes were added, "
+                f"{self.rows} rows in {self.episodes} episodes were stated"
+            )
         try:
             self._file.attrs["fingerprint"] = self._hash.hexdigest()
             self._file.close()
@@ -205,6 +207,19 @@ class EpisodeWriter:
             raise self._cannot_write(error) from error
 
 
-def _with_final_row(array: np.ndarray, filler: int) -> np.ndarray:
-    """(T - 1, ...) -> (T, ...): the final observation has no action, reward or end."""
-    return np.concatenate([array, np.full((1, *array.shape[1:]), filler, dtype=array.dtype)])
+def remove_leftovers(path: Path) -> None:
+    """Delete what processes that were killed while they wrote this file have left beside it."""
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.tmp-*"):
+        number = leftover.name.rpartition("-")[2]
+        if number.isascii() and number.isdigit() and not _is_alive(int(number)):
+            leftover.unlink(missing_ok=True)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # it belongs to someone else
+        return True
+    return True
