@@ -62,7 +62,7 @@ def columns_of(
     rewards: bool,
 ) -> dict[str, Column]:
     """Key in the store -> column, in the order of allocation."""
-    columns = {f"observations/{name}": Column(s.shape, s.dtype, finite=True) for name, s in observations.items()}
+    columns = {f"observations/{name}": Column(s.shape, s.dtype) for name, s in observations.items()}
     if actions is not None and actions.kind == "discrete":
         columns["actions"] = Column((), "int64", highest=actions.size - 1, filler=-1)
     elif actions is not None:

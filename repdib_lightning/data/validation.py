@@ -12,8 +12,6 @@ from repdib_lightning.data.schema import FORMAT, SCHEMA_VERSION, FactorSpec
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.records import ActionSpec, ArraySpec
 
-_ROWS_A_READ = 65_536
-
 
 def attribute(owner: Any, name: str, default: Any = None) -> Any:
     """An attribute as plain Python: byte strings decoded, NumPy scalars and arrays of one element unpacked."""
@@ -101,7 +99,7 @@ def observation_specs(path: Path, file: h5py.File) -> dict[str, ArraySpec]:
     """Shape and dtype of each observation.
 
     Raises:
-        UserError: there is none, or one is of another dtype, has no axis but that of the rows, or holds NaN (vectors).
+        UserError: there is none, or one is of another dtype, or has no axis but that of the rows.
     """
     specs = {}
     for name, data in members(path, file, "observations"):
@@ -116,18 +114,9 @@ def observation_specs(path: Path, file: h5py.File) -> dict[str, ArraySpec]:
                 f"{path}: {key} has shape {data.shape}, must be (N, X) or (N, C, H, W); a scalar is stored as (N, 1)"
             )
         specs[name] = ArraySpec(tuple(data.shape[1:]), "uint8" if data.dtype == np.uint8 else "float32")
-        if data.ndim == 2 and data.dtype == np.float32:  # pictures are too large to be read whole
-            _check_finite(path, key, data)
     if not specs:
         raise UserError(f"{path}: 'observations' is empty")
     return specs
-
-
-def _check_finite(path: Path, key: str, data: h5py.Dataset) -> None:
-    for start in range(0, len(data), _ROWS_A_READ):
-        bad = np.flatnonzero(~np.isfinite(data[start : start + _ROWS_A_READ]).all(axis=1))
-        if len(bad):
-            raise UserError(f"{path}: {key} is not finite (NaN or infinite) at row {start + bad[0]}")
 
 
 def check_episodes(path: Path, starts: np.ndarray, lengths: np.ndarray, evaluation: np.ndarray, rows: int) -> None:
