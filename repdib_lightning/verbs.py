@@ -6,7 +6,7 @@ import argparse
 import importlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, NoReturn, get_type_hints
 
 from repdib_lightning.errors import UserError, nearest
 
@@ -56,27 +56,39 @@ def probe(arguments: list[str]) -> int:
 
 def compare(arguments: list[str]) -> int:
     """``compare DATA OUTPUT RUN [RUN ...]``: ratios are relative to the first run."""
-    parser = argparse.ArgumentParser(
-        prog="python -m repdib_lightning compare",
-        description="Probe exported runs on one data set, side by side: a table here, an HTML page with pictures.",
-        allow_abbrev=False,
-    )
-    parser.add_argument("data", type=Path, help="a data file with factors")
-    parser.add_argument("output", type=Path, help="the HTML page to write; the numbers go into a .json beside it")
-    parser.add_argument("runs", type=Path, nargs="+", help="run folders that were exported, or bundles")
-    options = parser.parse_args(arguments)
-    bundles: dict[str, Path] = {}
-    for run in options.runs:
-        if run.resolve().name in bundles:
-            raise UserError(f"compare: two runs are called '{run.resolve().name}'")
-        bundles[run.resolve().name] = run / "bundle" if (run / "bundle").is_dir() else run
+    from repdib_lightning.evaluation.bundles import named_bundles
+
+    options = _comparison_options(arguments)
+    bundles = named_bundles(options.runs)
     from repdib_lightning.evaluation.report import compare as compare_bundles
 
     curves = {name: path.parent / "metrics.csv" for name, path in bundles.items()}
     known = {name: path for name, path in curves.items() if path.is_file()}
-    print(compare_bundles(bundles, options.data, options.output, metrics=known))
+    chosen = {"probes": options.probes, "seed": options.seed, "device": options.device}
+    print(compare_bundles(bundles, options.data, options.output, metrics=known, **chosen))
     print(f"wrote {options.output}")
     return 0
+
+
+class _OneLineParser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"compare: {message}")
+
+
+def _comparison_options(arguments: list[str]) -> argparse.Namespace:
+    parser = _OneLineParser(
+        prog="python -m repdib_lightning compare",
+        description="Probe exported runs on one data set, side by side: a table here, an HTML page with pictures.",
+        epilog="Beside OUTPUT.html, OUTPUT.json holds the numbers and OUTPUT-kept.png the bars; all are replaced.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("data", type=Path, help="a data file with factors")
+    parser.add_argument("output", type=Path, help="the HTML page to write (.html)")
+    parser.add_argument("runs", nargs="+", help="runs that were exported, or bundles; NAME=PATH names one")
+    parser.add_argument("--probes", default="linear,mlp", help="linear, mlp or linear,mlp (default)")
+    parser.add_argument("--seed", type=int, default=0, help="of the MLP and of the permutation null (default: 0)")
+    parser.add_argument("--device", default="auto", help="runs the encoders (default: auto, a GPU if there is one)")
+    return parser.parse_args(arguments)
 
 
 def _choose(verb: str, what: str, known: dict[str, str], arguments: list[str]) -> tuple[str, list[str]]:

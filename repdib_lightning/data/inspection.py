@@ -20,6 +20,7 @@ from repdib_lightning.data.findings import (
 from repdib_lightning.data.fingerprint import recompute_fingerprint
 from repdib_lightning.data.foreign import describe_foreign
 from repdib_lightning.data.inspection_text import bar, file_size, short_number, spread, table
+from repdib_lightning.data.outputs import check_output_file
 from repdib_lightning.errors import UserError
 
 _MOST_LISTED = 12
@@ -53,7 +54,7 @@ def inspect_store(path: Path, *, contact_sheet: Path | None = None, verify: bool
 
     Args:
         path: the store; or a file or folder of another format.
-        contact_sheet: where to write the PNG; default: beside the store, under its name.
+        contact_sheet: where to write the PNG (.png); default: beside the store, under its name.
         verify: hash the whole content again and compare with the fingerprint that was written with it.
 
     Returns:
@@ -61,9 +62,11 @@ def inspect_store(path: Path, *, contact_sheet: Path | None = None, verify: bool
 
     Raises:
         UserError: naming file, key and episode: missing, truncated, not a store, arrays that disagree; or the content
-            does not match its fingerprint.
+            does not match its fingerprint. Or a contact sheet that is no .png, the store itself or cannot be written.
     """
     path = Path(path)
+    if contact_sheet is not None:
+        check_output_file(Path(contact_sheet), "--contact_sheet", ".png", [path])
     foreign = describe_foreign(path)
     if foreign is not None:
         return Inspection(foreign)
@@ -83,7 +86,9 @@ def inspect_store(path: Path, *, contact_sheet: Path | None = None, verify: bool
     )
     warnings = slow_layouts(store) + suspicious_content(store, samples)
     try:
-        sheet = draw_contact_sheet(store, contact_sheet or path.with_suffix(".png"))
+        place = Path(contact_sheet or path.with_suffix(".png"))
+        check_output_file(place, "--contact_sheet", ".png", [path])
+        sheet = draw_contact_sheet(store, place)
     except UserError as error:
         if contact_sheet is not None:
             raise

@@ -20,11 +20,13 @@ def read_curves(path: Path) -> dict[str, np.ndarray]:
     """Columns of a metrics.csv with a ``step`` column: name -> (n, 2) of (step, value), empty cells left out.
 
     Raises:
-        UserError: no such file, or no ``step`` column.
+        UserError: no such file, no ``step`` column, or a cell that is no number.
     """
     try:
         with open(path, newline="") as file:
             lines = list(csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"{path}: not a readable CSV file ({error})") from error
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from error
     if lines and "step" not in lines[0]:
@@ -33,8 +35,15 @@ def read_curves(path: Path) -> dict[str, np.ndarray]:
     for line in lines:
         for name, cell in line.items():
             if name not in ("step", "epoch") and cell and line["step"]:
-                curves.setdefault(name, []).append((float(line["step"]), float(cell)))
+                curves.setdefault(name, []).append((_number(path, line["step"]), _number(path, cell)))
     return {name: np.array(points) for name, points in curves.items()}
+
+
+def _number(path: Path, cell: str | list[str]) -> float:
+    try:
+        return float(cell)  # type: ignore[arg-type]
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{path}: {cell!r:.60} is no number") from error
 
 
 def training_curves(files: Mapping[str, Path]) -> bytes | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,8 +15,10 @@ from tqdm import tqdm
 
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.files import whole_file
+from repdib_lightning.data.outputs import check_output_file
 from repdib_lightning.data.schema import FactorSpec
 from repdib_lightning.errors import UserError
+from repdib_lightning.evaluation.bundles import bundle_of, display_name, protected_files
 from repdib_lightning.evaluation.codes import CodebookUse, FactorBits, codebook_use, factor_bits
 from repdib_lightning.evaluation.features import Encodes, check_compatible, encode_rows, resolve_device
 from repdib_lightning.evaluation.probes import (
@@ -30,6 +33,7 @@ from repdib_lightning.evaluation.probes import (
 )
 from repdib_lightning.evaluation.splits import ProbeSplit, split_evaluation
 from repdib_lightning.evaluation.tables import report_table
+from repdib_lightning.word_lists import words
 
 if TYPE_CHECKING:
     from repdib_lightning.export import FrozenEncoder
@@ -68,7 +72,7 @@ class ProbeReport:
     """Every factor of a data set, read from one frozen encoder.
 
     Attributes:
-        name: of the bundle.
+        name: of the bundle; of the run where the bundle is runs/<name>/bundle.
         data, fingerprint: the store, by file name and hash of its content.
         features: M. groups: G. seed: of the probes.
         fit_episodes, score_episodes: which evaluation episodes each half holds.
@@ -139,7 +143,7 @@ def probe_bundle(
     data: Path,
     *,
     output: Path | None = None,
-    probes: tuple[str, ...] = PROBES,
+    probes: str | Sequence[str] = ",".join(PROBES),
     device: str = "auto",
     seed: int = 0,
     progress: bool = True,
@@ -147,46 +151,59 @@ def probe_bundle(
     """Probe an exported encoder for every factor of a data set, and write the result as JSON.
 
     Args:
-        bundle: folder of an exported encoder.
+        bundle: folder of an exported encoder, or of a run that holds one.
         data: a store with factors and at least two evaluation episodes.
-        output: the JSON file; ``probe.json`` in the bundle by default.
-        probes: ``linear``, ``mlp`` or both.
+        output: the JSON file (.json); ``probe.json`` in the bundle by default.
+        probes: ``linear``, ``mlp`` or ``linear,mlp``.
         device: runs the encoder; the probes run on the CPU.
         seed: of the MLP and of the permutation null.
         progress: show progress bars.
 
     Raises:
-        UserError: bad bundle or data, observations that do not match, no factors, too few evaluation episodes.
+        UserError: bad bundle or data, observations that do not match, no factors, too few evaluation episodes, or an
+            output that is no .json file, cannot be written or would replace what is read.
     """
-    check_probes(tuple(probes))
+    chosen = check_options(probes, seed)
+    folder = bundle_of(Path(bundle))
+    target = folder / "probe.json" if output is None else Path(output)
+    encoder = load_for_probing(folder, device)
+    check_output_file(target, "--output", ".json", [Path(data), *protected_files(folder)])
     store = open_for_probing(data)
-    _, report, _ = probe_one(bundle, store, probes=tuple(probes), device=device, seed=seed, progress=progress)
-    report.write(Path(output) if output is not None else Path(bundle) / "probe.json")
+    check_compatible(encoder, store, str(folder))
+    encoded = encode_evaluation(encoder, store, device=encoder.device, progress=progress)
+    report = probe_encoded(encoded, store, name=display_name(folder), probes=chosen, seed=seed, progress=progress)
+    report.write(target)
     return report
 
 
-def probe_one(
-    bundle: Path, store: EpisodeStore, *, probes: tuple[str, ...], device: str, seed: int, progress: bool
-) -> tuple[Encoded, ProbeReport, FrozenEncoder]:
-    """Load, encode and probe one bundle; nothing is written."""
+def check_options(probes: str | Sequence[str], seed: int) -> tuple[str, ...]:
+    """Check what needs no file, and return the names of the probes.
+
+    Raises:
+        UserError: an unknown probe, none, or a seed that no generator takes.
+    """
+    chosen = words(probes, "probes")
+    check_probes(chosen)
+    if not 0 <= seed < 2**63:
+        raise UserError(f"seed must be at least 0 and below 2^63, is {seed}")
+    return chosen
+
+
+def load_for_probing(bundle: Path, device: str) -> FrozenEncoder:
+    """Load a bundle onto a device. Raises UserError if there is no such bundle or device."""
     from repdib_lightning.export import load_encoder
 
-    target = resolve_device(device)
-    encoder = load_encoder(bundle).to(target)
-    check_compatible(encoder, store, str(bundle))
-    encoded = encode_evaluation(encoder, store, device=target, progress=progress)
-    name = Path(bundle).resolve().name
-    report = probe_encoded(encoded, store, name=name, probes=probes, seed=seed, progress=progress)
-    return encoded, report, encoder
+    return load_encoder(bundle).to(resolve_device(device))
 
 
 def open_for_probing(data: Path) -> EpisodeStore:
     """Open a store and check that it can be probed.
 
     Raises:
-        UserError: it cannot be read, has no factors, or has NaN in one.
+        UserError: it cannot be read, has no factors, NaN in one, or too few evaluation episodes.
     """
     store = EpisodeStore(data)
+    split_evaluation(store)
     if not store.factors:
         raise UserError(f"{data}: has no 'factors' to probe for (keys: observations, ...); nothing to measure")
     for name, spec in store.factors.items():

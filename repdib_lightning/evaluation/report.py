@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,21 @@ import numpy as np
 
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.files import whole_file
+from repdib_lightning.data.outputs import check_output_file
 from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation import curves, figures
-from repdib_lightning.evaluation.probe import Encoded, ProbeReport, open_for_probing, probe_one
-from repdib_lightning.evaluation.probes import PROBES, check_probes
+from repdib_lightning.evaluation.bundles import protected_files
+from repdib_lightning.evaluation.features import check_compatible
+from repdib_lightning.evaluation.probe import (
+    Encoded,
+    ProbeReport,
+    check_options,
+    encode_evaluation,
+    load_for_probing,
+    open_for_probing,
+    probe_encoded,
+)
+from repdib_lightning.evaluation.probes import PROBES
 from repdib_lightning.evaluation.tables import comparison_table, notes
 
 SCATTERED = 2000
@@ -65,7 +76,7 @@ def compare(
     *,
     metrics: Mapping[str, Path] | None = None,
     title: str = "What the representation kept and dropped",
-    probes: tuple[str, ...] = PROBES,
+    probes: str | Sequence[str] = PROBES,
     device: str = "auto",
     seed: int = 0,
     progress: bool = True,
@@ -75,38 +86,57 @@ def compare(
     Args:
         bundles: run name -> folder of an exported encoder; ratios are relative to the first.
         data: a store with factors and at least two evaluation episodes.
-        output: the HTML file. A ``.json`` beside it holds every report in full, a ``.png`` the bars.
+        output: the HTML file (.html). Beside it ``<stem>.json`` holds every report in full, ``<stem>-kept.png`` the
+            bars; files of these names are replaced.
         metrics: run name -> metrics.csv, for the training curves.
         title, probes, device, seed, progress: as in :func:`repdib_lightning.evaluation.probe.probe_bundle`.
 
     Raises:
-        UserError: as ``probe_bundle`` does; nothing is written then.
+        UserError: as ``probe_bundle`` does; nothing is written then. All bundles are read before any is probed.
     """
     if not bundles:
         raise UserError("compare: at least one bundle is needed")
-    check_probes(tuple(probes))
+    chosen = check_options(probes, seed)
+    output, data, metrics = Path(output), Path(data), metrics or {}
+    check_outputs(output, [data, *(file for bundle in bundles.values() for file in protected_files(Path(bundle)))])
+    encoders = {name: load_for_probing(Path(bundle), device) for name, bundle in bundles.items()}
+    for path in metrics.values():
+        curves.read_curves(path)
     store = open_for_probing(data)
+    for name, encoder in encoders.items():
+        check_compatible(encoder, store, str(bundles[name]))
     runs = {}
-    for name, bundle in bundles.items():
-        encoded, report, frozen = probe_one(
-            Path(bundle), store, probes=tuple(probes), device=device, seed=seed, progress=progress
-        )
-        description = getattr(frozen, "description", None)
-        runs[name] = RunResult(report, encoded, description, (metrics or {}).get(name), Path(bundle))
+    for name, encoder in encoders.items():
+        encoded = encode_evaluation(encoder, store, device=encoder.device, progress=progress)
+        report = probe_encoded(encoded, store, name=name, probes=chosen, seed=seed, progress=progress)
+        runs[name] = RunResult(report, encoded, encoder.description, metrics.get(name), Path(bundles[name]))
     write_comparison(output, runs, store, title=title)
     reports = {name: run.report for name, run in runs.items()}
     return "\n".join([comparison_table(reports).text(), "", *notes(reports)])
 
 
+def check_outputs(output: Path, inputs: Sequence[Path]) -> None:
+    """Check that the page and the two files beside it can be written. Raises UserError naming OUTPUT."""
+    check_output_file(output, "OUTPUT", ".html", inputs)
+    for path in beside(output):
+        check_output_file(path, "OUTPUT's side file", path.suffix, inputs)
+
+
+def beside(output: Path) -> tuple[Path, Path]:
+    """The numbers and the bars; not ``<stem>.png``, which is the contact sheet of a data set of that name."""
+    return output.with_suffix(".json"), output.with_name(f"{output.stem}-kept.png")
+
+
 def write_comparison(output: Path, runs: Mapping[str, RunResult], store: EpisodeStore, *, title: str) -> None:
-    """Write the page of several probed runs; beside it the numbers (``.json``) and the bars of kept (``.png``)."""
+    """Write the page of several probed runs; beside it the numbers and the bars of kept."""
     output = Path(output)
     reports = {name: run.report for name, run in runs.items()}
     plain = json.dumps({name: report.to_dict() for name, report in reports.items()}, indent=2, allow_nan=False)
     page = render_page(title, comparison_sections(runs, store))
-    with whole_file(output.with_suffix(".json")) as aside:
+    numbers, bars = beside(output)
+    with whole_file(numbers) as aside:
         aside.write_text(plain + "\n")
-    with whole_file(output.with_suffix(".png")) as aside:
+    with whole_file(bars) as aside:
         aside.write_bytes(figures.kept_bars(reports))
     with whole_file(output) as aside:
         aside.write_text(page, encoding="utf-8")

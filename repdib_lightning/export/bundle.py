@@ -22,6 +22,7 @@ from repdib_lightning.errors import UserError
 from repdib_lightning.export.description import CONFIG, WEIGHTS, as_text, bundle_config, sealed
 from repdib_lightning.export.formats import check_formats, write_format
 from repdib_lightning.export.load import load_encoder
+from repdib_lightning.word_lists import words
 
 
 def save_bundle(
@@ -32,7 +33,7 @@ def save_bundle(
     training: Mapping[str, Any],
     data: Mapping[str, Any],
     overwrite: bool = False,
-    formats: Sequence[str] = ("safetensors",),
+    formats: str | Sequence[str] = "safetensors",
 ) -> Path:
     """Write ``config.json``, ``model.safetensors`` and the optional formats; read back before it is published.
 
@@ -43,7 +44,7 @@ def save_bundle(
         training: plain facts of the run (objective, steps, run).
         data: plain facts of the data (file, fingerprint); folders of absolute paths are left out.
         overwrite: replace an existing bundle (never a folder that holds anything else).
-        formats: ``safetensors`` (always written), ``pt2`` (torch.export), ``onnx``.
+        formats: ``safetensors`` (always written), ``pt2`` (torch.export), ``onnx``; several between commas.
 
     Returns:
         The folder.
@@ -54,14 +55,15 @@ def save_bundle(
     """
     target = Path(folder)
     _check_target(target, overwrite)
-    check_formats(formats)
+    chosen = words(formats, "formats")
+    check_formats(chosen)
     _check_trained(encoder, bottleneck)
     config = bundle_config(encoder, bottleneck, training, data)
     content = tensors_to_bytes(_weights(encoder, bottleneck))
     with _whole_folder(target) as aside:
         _write(aside, content, config, {})
         frozen = load_encoder(aside)
-        written = [name for chosen in formats for name in write_format(chosen, frozen, aside)]
+        written = [name for form in chosen for name in write_format(form, frozen, aside)]
         _write(aside, content, config, {name: _sha256(aside / name) for name in written})
     return target
 

@@ -34,6 +34,9 @@ FORMAT = "repdib_bundle"
 SCHEMA_VERSION = 1
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 
+MODEL_DESCRIPTION = "bundle.json"
+"""The file of a run folder that says how to rebuild its encoder and bottleneck."""
+
 PREPROCESSING: dict[str, str] = {
     "pictures": "uint8, channels first",
     "sensors": "float32",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -79,13 +80,17 @@ class FrozenEncoder(nn.Module):
         return latent, codes
 
     @torch.no_grad()
-    def decode(self, codes: Tensor) -> Tensor:
+    def decode(self, codes: Tensor | np.ndarray[Any, Any]) -> Tensor:
         """Map (N, G) or (G,) indices to the (N, M) or (M,) latent that they stand for.
 
         Raises:
             UserError: the bottleneck does not quantise, or indices of a wrong shape, type or range.
         """
         self._check_quantised()
+        if isinstance(codes, np.ndarray) and codes.dtype.kind in "biufc":
+            codes = torch.from_numpy(np.require(codes, requirements=["C", "W"]))
+        if not isinstance(codes, Tensor):
+            raise UserError(f"codes must be a numpy array of whole numbers or a tensor, are {_shown_type(codes)}")
         if codes.dim() not in (1, 2) or codes.shape[-1] != self.groups:
             raise UserError(f"codes have shape {tuple(codes.shape)}, expected (N, {self.groups}) or ({self.groups},)")
         if codes.is_floating_point() or codes.is_complex() or codes.dtype == torch.bool:
@@ -93,12 +98,18 @@ class FrozenEncoder(nn.Module):
         codes = codes.to(self.device, torch.int64)
         if codes.numel() and not 0 <= int(codes.min()) <= int(codes.max()) < self.codes_per_group:
             raise UserError(f"codes must be in [0, {self.codes_per_group}), are in [{codes.min()}, {codes.max()}]")
+        if not codes.numel():
+            return torch.empty(0, self.features, device=self.device)
         latent = self.bottleneck.decode(codes.reshape(-1, self.groups))
         return latent.reshape(*codes.shape[:-1], self.features)
 
     @torch.no_grad()
     def _run(self, observations: Observations) -> tuple[Tensor, Tensor | None]:
         tensors, is_batched = batched_observations(observations, self.spec, self.device)
+        # Here, since reshapes in encoders and quantisers cannot tell a size from no elements.
+        if is_batched and not all(map(len, tensors.values())):
+            codes = torch.empty(0, self.groups, dtype=torch.int64, device=self.device) if self.groups else None
+            return torch.empty(0, self.features, device=self.device), codes
         # An agent's autocast must not change what its frozen encoder returns.
         with torch.autocast(self.device.type, enabled=False):
             output = self.bottleneck(self.encoder(tensors))
@@ -110,3 +121,7 @@ class FrozenEncoder(nn.Module):
         if not self.groups:
             name = type(self.bottleneck).__name__
             raise UserError(f"this encoder has no codes: its bottleneck, {name}, quantises nothing")
+
+
+def _shown_type(value: object) -> str:
+    return f"an array of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -25,10 +26,14 @@ class EncodeObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
         encoder: what :func:`~repdib_lightning.export.load_encoder` returned.
 
     Raises:
-        UserError: the environment's observations do not fit the encoder; names the observation and both shapes.
+        UserError: something else than a frozen encoder; or the environment's observations do not fit it: names the
+            observation and both shapes or types.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], encoder: FrozenEncoder) -> None:
+        if not isinstance(encoder, FrozenEncoder):
+            what = f"'{encoder}'" if isinstance(encoder, (str, Path)) else f"a {type(encoder).__name__}"
+            raise UserError(f"EncodeObservation takes what load_encoder returned, got {what}")
         super().__init__(env)
         self.encoder = encoder
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (encoder.features,), np.float32)
@@ -75,6 +80,7 @@ class EncodeObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
 def _fit(name: str, space: gymnasium.Space[Any], array: ArraySpec, stack: int) -> tuple[bool, bool]:
     """Whether the space's channels are last, and whether it holds whole stacks."""
     given = tuple(space.shape or ())
+    _check_type(name, space, array)
     frame = (array.shape[0] // stack, *array.shape[1:])
     for channels_last in (False, True):
         if channels_last and not array.is_image:
@@ -83,3 +89,12 @@ def _fit(name: str, space: gymnasium.Space[Any], array: ArraySpec, stack: int) -
             if given == ((*shape[1:], shape[0]) if channels_last else shape):
                 return channels_last, whole
     raise UserError(f"the environment's observation '{name}' has shape {given}, the encoder takes frames of {frame}")
+
+
+def _check_type(name: str, space: gymnasium.Space[Any], array: ArraySpec) -> None:
+    """Pictures are uint8 and nothing else; sensors may be floats of any precision."""
+    fits = space.dtype is not None and (
+        np.issubdtype(space.dtype, np.floating) if array.dtype == "float32" else space.dtype == np.dtype(array.dtype)
+    )
+    if not fits:
+        raise UserError(f"the environment's observation '{name}' is {space.dtype}, the encoder takes {array.dtype}")

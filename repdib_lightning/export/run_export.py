@@ -14,11 +14,9 @@ from repdib_lightning.data.files import whole_file
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError
 from repdib_lightning.export.bundle import save_bundle
-from repdib_lightning.export.description import as_text, bundle_config, sealed
+from repdib_lightning.export.description import MODEL_DESCRIPTION, as_text, bundle_config, sealed
 from repdib_lightning.export.rebuild import fill, read_description, rebuild
-
-MODEL_DESCRIPTION = "bundle.json"
-"""The file of a run folder that says how to rebuild its encoder and bottleneck."""
+from repdib_lightning.word_lists import words
 
 
 def write_model_description(
@@ -55,7 +53,7 @@ def export_run(
     run_folder: str | Path,
     output: str | Path | None = None,
     overwrite: bool = False,
-    formats: Sequence[str] = ("safetensors",),
+    formats: str | Sequence[str] = "safetensors",
 ) -> Path:
     """Export the newest good checkpoint of a run as a bundle.
 
@@ -63,7 +61,7 @@ def export_run(
         run_folder: runs/<name>, as ``fit`` leaves it.
         output: the bundle's folder; ``<run_folder>/bundle`` by default.
         overwrite: replace an existing bundle.
-        formats: ``safetensors`` and optionally ``pt2``, ``onnx``.
+        formats: ``safetensors`` (always written), ``pt2``, ``onnx``; several between commas.
 
     Returns:
         The bundle's folder.
@@ -80,12 +78,10 @@ def export_run(
         raise UserError(f"{run}: holds no {MODEL_DESCRIPTION}, so it is no run folder or its fit never began")
     config = read_description(path)
     encoder, bottleneck = rebuild(path, config)
-    # Only here: load_encoder shares this package and must not wait for what training imports.
-    from repdib_lightning.callbacks.checkpoint_files import last_good
-
-    checkpoint_file = last_good(run)
+    checkpoint_file = _newest_checkpoint(run)
     checkpoint = torch.load(checkpoint_file, map_location="cpu", weights_only=True)
-    fill(checkpoint_file, nn.ModuleDict({"encoder": encoder, "bottleneck": bottleneck}), _parts(checkpoint), path.name)
+    modules = nn.ModuleDict({"encoder": encoder, "bottleneck": bottleneck})
+    fill(checkpoint_file, modules, _parts(checkpoint, modules), path.name)
     training = {"run": run.resolve().name, **config["training"], "steps": int(checkpoint["global_step"])}
     folder = run / "bundle" if output is None else Path(output)
     return save_bundle(
@@ -95,11 +91,31 @@ def export_run(
         training=training,
         data=config["data"],
         overwrite=overwrite,
-        formats=formats,
+        formats=words(formats, "formats"),
     )
 
 
-def _parts(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
-    """The weights of encoder and bottleneck; the objective's and the optimiser's stay behind."""
-    prefixes = ("encoder.", "bottleneck.")
-    return {name: value for name, value in checkpoint["state_dict"].items() if name.startswith(prefixes)}
+def _newest_checkpoint(run: Path) -> Path:
+    # Only here: load_encoder shares this package and must not wait for what training imports.
+    from repdib_lightning.callbacks.checkpoint_files import FOLDER, last_good, listed
+
+    # Asked first, since what last_good says of an empty folder is advice for resuming.
+    if not listed(run / FOLDER if (run / FOLDER).is_dir() else run):
+        raise UserError(f"{run}: has no checkpoint yet: nothing to export")
+    try:
+        return last_good(run)
+    except UserError as error:
+        raise UserError(f"{run}: all its checkpoints are damaged: nothing to export") from error
+
+
+def _parts(checkpoint: Mapping[str, Any], modules: nn.Module) -> dict[str, Tensor]:
+    """The weights of encoder and bottleneck; the objective's and the optimiser's stay behind.
+
+    A run in bf16-true or 64-true leaves weights of that precision; they become the modules' own, float32.
+    """
+    prefixes, expected = ("encoder.", "bottleneck."), modules.state_dict()
+    parts = {name: value for name, value in checkpoint["state_dict"].items() if name.startswith(prefixes)}
+    for name, value in parts.items():
+        if name in expected and value.is_floating_point() and expected[name].is_floating_point():
+            parts[name] = value.to(expected[name].dtype)
+    return parts

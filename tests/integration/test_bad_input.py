@@ -86,6 +86,13 @@ def fit(*options: str) -> list[str]:
         (["probe", "nowhere", "small.h5"], "nowhere"),
         (["probe", "nowhere"], "data"),
         (["compare", "small.h5", "out.html", "nowhere"], "nowhere"),
+        (["compare"], "compare: the following arguments are required: data, output, runs"),
+        (["compare", "small.h5", "out.html", "a", "--sed", "1"], "compare: unrecognized arguments: --sed"),
+        (["compare", "small.h5", "out.html", "a", "--seed", "x"], "compare: argument --seed: invalid int value"),
+        (["compare", "nowhere", "small.h5", "a"], "OUTPUT must end in .html, is 'small.h5'"),
+        (["compare", "small.h5", "out.html", "a", "--probes", "linaer"], "did you mean 'linear'?"),
+        (["inspect", "small.h5", "--contact_sheet", "small.h5"], "--contact_sheet must end in .png"),
+        (["probe", "nowhere", "small.h5", "--seed", "-1"], "seed must be at least 0"),
     ],
 )  # fmt: skip
 def test_one_line(here, capsys, arguments, wanted):
@@ -197,6 +204,20 @@ def test_a_run_in_training_is_not_resumed_twice(copy, capsys):
 def test_a_resumed_run_does_not_collect_data(copy, capsys):
     Path("small.h5").unlink()
     assert "small.h5: no such data file" in complaint(capsys, "fit", "--resume", "runs/a", "--trainer.max_steps", "9")
+
+
+def test_a_run_stands_for_its_bundle(copy, capsys):
+    make = ["--probes", "linear", "--progress", "false"]
+    assert main(["probe", "runs/a", "small.h5", *make]) == 0
+    assert json.loads(Path("runs/a/bundle/probe.json").read_text())["name"] == "a"
+    assert "--output must end in .json" in complaint(capsys, "probe", "runs/a", "small.h5", "--output", "small.h5")
+    assert "formats: expected" in complaint(capsys, "export", "runs/a", "--output", "x", "--formats", ",")
+    assert main(["export", "runs/a", "--output", "pt", "--formats", "pt2"]) == 0
+    assert Path("pt/model.pt2").is_file()
+    pair = ["runs/a", "again=runs/a"]
+    assert main(["compare", "small.h5", "out.html", *pair, "--probes", "linear", "--device", "cpu", "--seed", "2"]) == 0
+    written = json.loads(Path("out.json").read_text())
+    assert list(written) == ["a", "again"] and written["again"]["seed"] == 2
 
 
 def test_bundles(copy, capsys, make_store):

@@ -29,7 +29,7 @@ def test_counts_ranges_and_factors(store_file: Path) -> None:
     assert row_of(text, "rows")[:4] == ["rows", "45", "(41", "with"]
     assert "4; length: min 9, median 11.5, max 13" in text
     assert row_of(text, "evaluation")[1:] == ["2", "episodes,", "as", "stored"]
-    assert " ".join(row_of(text, "observations/front")[1:10]) == "45 x 3 x 20 x 20 uint8 contiguous"
+    assert " ".join(row_of(text, "observations/front")[1:10]) == "45 x 3 x 24 x 24 uint8 contiguous"
     assert row_of(text, "fingerprint") == ["fingerprint", store.fingerprint]
     assert " ".join(row_of(text, "cell")) == "cell endogenous categorical 4 of 4 classes occur"
     assert row_of(text, "light")[:3] == ["light", "exogenous", "continuous"]
@@ -104,8 +104,8 @@ def test_contact_sheet_of_other_pictures(tmp_path: Path, shape: tuple[int, ...])
 @pytest.mark.parametrize(
     ("chunks", "compression", "words"),
     [
-        ((20, 3, 20, 20), "gzip", ["gzip", "23.4 KiB", "thousands of times"]),
-        ((1, 3, 20, 20), "lzf", ["lzf", "decodes 1.2 KiB", "about 100 times"]),
+        ((20, 3, 24, 24), "gzip", ["gzip", "33.8 KiB", "thousands of times"]),
+        ((1, 3, 24, 24), "lzf", ["lzf", "decodes 1.7 KiB", "about 100 times"]),
     ],
 )
 def test_slow_layouts_say_what_to_run(
@@ -201,3 +201,16 @@ def test_bad_files_are_one_line(store_file: Path, tmp_path: Path, make_store: Ca
         with pytest.raises(UserError) as caught:
             inspect_store(tmp_path / name)
         assert words in str(caught.value) and name in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_contact_sheet_replaces_no_other_file(store_file: Path, tmp_path: Path) -> None:
+    content = store_file.read_bytes()
+    with pytest.raises(UserError, match=r"--contact_sheet must end in \.png, is '.*small\.h5'"):
+        inspect_store(store_file, contact_sheet=store_file)
+    named_png = tmp_path / "data.png"
+    named_png.write_bytes(content)
+    with pytest.raises(UserError, match=r"--contact_sheet would replace .*data\.png"):
+        inspect_store(named_png, contact_sheet=tmp_path / "x" / ".." / "data.png")
+    report = inspect_store(named_png)
+    assert report.contact_sheet is None and "would replace" in report.warnings[-1]
+    assert store_file.read_bytes() == content and named_png.read_bytes() == content

@@ -13,6 +13,8 @@ from repdib_lightning.bottlenecks import Identity, VectorQuantiser
 from repdib_lightning.encoders import ConvolutionalEncoder
 from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation import figures
+from repdib_lightning.evaluation import probe as probe_module
+from repdib_lightning.evaluation.bundles import named_bundles
 from repdib_lightning.evaluation.curves import read_curves, training_curves
 from repdib_lightning.evaluation.probe import encode_evaluation, probe_encoded
 from repdib_lightning.evaluation.report import RunResult, Section, compare, render_page, write_comparison, write_report
@@ -74,6 +76,8 @@ def test_bundles_are_compared_end_to_end(tmp_path, store):
     assert "noise: relative to none" in text and "of 4 codes used per group" in text
     written = json.loads(output.with_suffix(".json").read_text())
     assert [run["groups"] for run in written.values()] == [0, 2]
+    assert [run["name"] for run in written.values()] == ["none", "vq"]
+    assert sorted(p.name for p in output.parent.iterdir()) == ["report-kept.png", "report.html", "report.json"]
     page = output.read_text()
     assert "VectorQuantiser" in page and "encoder.codes(observations)" in page
     with pytest.raises(UserError, match="no such bundle"):
@@ -180,3 +184,52 @@ def test_curves_skip_empty_cells_and_name_what_is_wrong(tmp_path):
         read_curves(path)
     with pytest.raises(UserError, match=r"gone\.csv: cannot be read"):
         read_curves(tmp_path / "gone.csv")
+
+
+def test_everything_cheap_is_checked_before_any_encoder_runs(tmp_path, store, monkeypatch):
+    monkeypatch.setattr(probe_module, "encode_rows", lambda *_, **__: pytest.fail("encoded before the checks"))
+    good, bundle = {"a": export(tmp_path / "a" / "bundle", Identity(8))}, tmp_path / "a" / "bundle"
+    (tmp_path / "folder.html").mkdir()
+    (tmp_path / "side.json").mkdir()
+    (tmp_path / "file").touch()
+    (tmp_path / "metrics.csv").write_text("step,loss\n0,much\n")
+    data = write_store(tmp_path / "page.json")
+    precious = data.path.read_bytes()
+    out = tmp_path / "out.html"
+    for bundles, path, output, options, words in (
+        (good, store.path, data.path.with_suffix(".h5"), {}, r"OUTPUT must end in \.html"),
+        (good, data.path, tmp_path / "page.html", {}, r"OUTPUT's side file would replace .*page\.json"),
+        (good, store.path, bundle / "config.html", {}, r"would replace .*config\.json"),
+        (good, store.path, tmp_path / "folder.html", {}, r"OUTPUT .*folder\.html: cannot be written"),
+        (good, store.path, tmp_path / "side.html", {}, r"side file .*side\.json: cannot be written"),
+        (good, store.path, tmp_path / "file" / "x.html", {}, r"OUTPUT .*x\.html: cannot be written"),
+        (good | {"b": tmp_path / "b"}, store.path, out, {}, "b: no such bundle"),
+        (good, store.path, out, {"metrics": {"a": tmp_path / "metrics.csv"}}, r"metrics\.csv: 'much' is no number"),
+        (good, store.path, out, {"seed": -3}, "seed must be at least 0"),
+        (good, write_store(tmp_path / "one.h5", 2, 1).path, out, {}, "at least 2 evaluation episodes"),
+    ):
+        with pytest.raises(UserError, match=words):
+            compare(bundles, path, output, device="cpu", progress=False, **options)
+    assert data.path.read_bytes() == precious and not out.exists()
+
+
+def test_names_are_the_shortest_ends_that_differ(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for run in ("old/a", "new/a", "x/new/a", "b", "lr=0.1"):
+        (tmp_path / run / "bundle").mkdir(parents=True)
+    assert list(named_bundles(["old/a", "b", "new/a/bundle"])) == ["old/a", "b", "new/a"]
+    assert list(named_bundles(["new/a", "x/new/a", "old/a"])) == [f"{tmp_path.name}/new/a", "x/new/a", "old/a"]
+    named = named_bundles(["first=old/a", "new/a", "lr=0.1"])
+    assert {name: str(path) for name, path in named.items()} == {
+        "first": "old/a/bundle",
+        "a": "new/a/bundle",
+        "lr=0.1": "lr=0.1/bundle",
+    }
+    assert list(named_bundles(["a=b", "old/a"])) == ["a", "old/a"]
+    for given, words in (
+        (["b", "./b/bundle"], "b is given twice; name them: NAME=PATH"),
+        (["x=b", "x=old/a"], "two runs are called 'x'"),
+        (["=b"], "expected PATH or NAME=PATH, got '=b'"),
+    ):
+        with pytest.raises(UserError, match=words):
+            named_bundles(given)

@@ -1,5 +1,6 @@
 import json
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -15,6 +16,7 @@ from evaluation_fakes import (
 from repdib_lightning.bottlenecks import Identity
 from repdib_lightning.encoders import ConvolutionalEncoder
 from repdib_lightning.errors import UserError
+from repdib_lightning.evaluation import probe as probe_module
 from repdib_lightning.evaluation.probe import (
     encode_evaluation,
     open_for_probing,
@@ -114,9 +116,11 @@ def test_a_constant_factor_and_an_unseen_class_are_told(tmp_path):
 
 
 def test_a_factor_with_nan_is_a_user_error(tmp_path):
-    bad = np.zeros(LENGTH)
-    bad[3] = np.nan
-    write_store(tmp_path / "nan.h5", factors={"time_step": lambda e: bad})
+    write_store(tmp_path / "nan.h5")
+    with h5py.File(tmp_path / "nan.h5", "r+") as file:
+        values = file["factors/time_step"][:]
+        values[3::LENGTH] = np.nan
+        file["factors/time_step"][...] = values
     with pytest.raises(UserError, match=r"nan\.h5: 'factors/time_step' is NaN or infinite at row 3; 10 such rows"):
         open_for_probing(tmp_path / "nan.h5")
 
@@ -145,7 +149,7 @@ def test_a_bundle_is_probed_and_the_json_lies_in_it(tmp_path, store):
     report = probe_bundle(bundle, store.path, probes=("linear",), device="cpu", progress=False)
     written = json.loads((bundle / "probe.json").read_text())
     assert written == json.loads(json.dumps(report.to_dict()))
-    assert written["name"] == "bundle" and written["features"] == 8
+    assert written["name"] == tmp_path.name and written["features"] == 8
     assert written["summary"]["endogenous"]["linear"] == report.factors["cell"].probes["linear"].kept
     assert report.factors["cell"].probes["linear"].kept > 0.9
     probe_bundle(bundle, store.path, output=tmp_path / "x" / "y.json", probes=("linear",), progress=False)
@@ -157,3 +161,52 @@ def test_a_bundle_for_another_size_is_refused_and_nothing_is_written(tmp_path, s
     with pytest.raises(UserError, match=r"arm\.h5: observation 'front' is 3x16x16 uint8, .*large was trained on 3x32x"):
         probe_bundle(bundle, store.path, device="cpu", progress=False)
     assert not (bundle / "probe.json").exists()
+
+
+def test_a_run_stands_for_its_bundle_and_gives_the_report_its_name(tmp_path, store):
+    run = tmp_path / "runs" / "arm"
+    export(run / "bundle")
+    report = probe_bundle(run, store.path, probes="linear", device="cpu", progress=False)
+    assert report.name == "arm" and report.probes == ["linear"]
+    assert (run / "bundle" / "probe.json").is_file() and not (run / "probe.json").exists()
+
+
+@pytest.fixture
+def no_work(monkeypatch):
+    """Bad input must be found before anything is encoded."""
+    monkeypatch.setattr(probe_module, "encode_rows", lambda *_, **__: pytest.fail("encoded before the checks"))
+
+
+def test_bad_options_are_found_before_the_work_and_replace_nothing(tmp_path, store, no_work):
+    bundle = export(tmp_path / "a" / "bundle")
+    (tmp_path / "a" / "bundle.json").write_text("{}")
+    (tmp_path / "folder.json").mkdir()
+    (tmp_path / "file").touch()
+    config = (bundle / "config.json").read_bytes()
+    for options, words in (
+        ({"output": store.path}, r"--output must end in \.json, is '.*arm\.h5'"),
+        ({"output": bundle / "config.json"}, r"--output would replace .*config\.json"),
+        ({"output": tmp_path / "a" / "x" / ".." / "bundle.json"}, r"--output would replace .*bundle\.json"),
+        ({"output": tmp_path / "folder.json"}, r"--output .*folder\.json: cannot be written"),
+        ({"output": tmp_path / "file" / "x.json"}, r"--output .*x\.json: cannot be written"),
+        ({"seed": -1}, "seed must be at least 0.*is -1"),
+        ({"seed": 2**70}, "seed must be at least 0"),
+        ({"probes": "linaer"}, "unknown probe 'linaer'.*did you mean 'linear'"),
+        ({"probes": ""}, "probes: expected a word"),
+        ({"probes": [3]}, "probes: expected a word"),
+        ({"device": "gpu"}, "device 'gpu' cannot be used"),
+    ):
+        with pytest.raises(UserError, match=words):
+            probe_bundle(bundle, store.path, progress=False, **options)
+    assert (bundle / "config.json").read_bytes() == config and not (bundle / "probe.json").exists()
+
+
+def test_a_run_that_was_not_exported_says_what_to_do(tmp_path, store, no_work):
+    (tmp_path / "a" / "checkpoints").mkdir(parents=True)
+    with pytest.raises(UserError, match=r"a: is a run: export it"):
+        probe_bundle(tmp_path / "a", store.path, progress=False)
+
+
+@pytest.mark.parametrize("probes", ["linear,mlp", "linear, mlp", "[linear, mlp]", ["linear", "mlp"], "linear,mlp,mlp"])
+def test_probes_are_named_in_any_usual_form(probes):
+    assert probe_module.check_options(probes, 0) == ("linear", "mlp")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -274,3 +275,29 @@ def test_an_unknown_device_is_one_line(tmp_path: Path) -> None:
     save(tmp_path / "b", name="Identity")
     with pytest.raises(UserError, match="device 'gpu' cannot be used"):
         load_encoder(tmp_path / "b", device="gpu")
+
+
+@pytest.mark.parametrize("name", sorted(BOTTLENECKS))
+def test_no_observations_give_no_latents(tmp_path: Path, name: str) -> None:
+    save(tmp_path / "b", TWO_VIEWS, name)
+    frozen, none = load_encoder(tmp_path / "b"), example_batch(TWO_VIEWS, 0)
+    assert frozen.encode(none).shape == (0, 16) and frozen.encode(none).dtype == torch.float32
+    if frozen.groups:
+        assert frozen.codes(none).shape == (0, 4) and frozen.codes(none).dtype == torch.int64
+        assert frozen.decode(frozen.codes(none)).shape == (0, 16)
+
+
+def test_codes_are_decoded_from_numpy_too(tmp_path: Path) -> None:
+    save(tmp_path / "b")
+    frozen = load_encoder(tmp_path / "b")
+    latent, codes = frozen.encode_with_codes(example_batch(ONE_VIEW, 3))
+    for given in (codes.numpy(), codes.numpy().astype(np.uint16), codes.numpy()[::-1][::-1]):
+        assert torch.equal(frozen.decode(given), latent)
+    not_codes: list[tuple[Any, str]] = [
+        (codes.numpy().astype(np.float32), "whole numbers, are torch.float32"),
+        (codes.tolist(), "are list"),
+        (np.array([["a"] * 4]), "are an array of"),
+    ]
+    for wrong, words in not_codes:
+        with pytest.raises(UserError, match=words):
+            frozen.decode(wrong)

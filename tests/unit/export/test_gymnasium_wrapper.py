@@ -115,3 +115,13 @@ def test_an_environment_that_does_not_fit_is_refused_at_once(tmp_path: Path) -> 
         EncodeObservation(Noise(PICTURE), two)
     with pytest.raises(UserError, match=r"no observation 'top'"):
         EncodeObservation(Noise(Dict({"front": PICTURE})), two)
+
+
+def test_types_are_checked_when_the_wrapper_is_made(tmp_path: Path) -> None:
+    encoder = encoder_for(tmp_path / "b", ONE)
+    with pytest.raises(UserError, match="'front' is float32, the encoder takes uint8"):
+        EncodeObservation(Noise(Box(0, 1, (12, 12, 3), np.float32)), encoder)
+    made_by_hand: list[Any] = [tmp_path / "b", encoder.encoder, None]
+    for wrong in made_by_hand:
+        with pytest.raises(UserError, match="takes what load_encoder returned, got"):
+            EncodeObservation(Noise(PICTURE), wrong)

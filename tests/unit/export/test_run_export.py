@@ -105,7 +105,7 @@ def test_what_is_missing_is_named(run: tuple[Path, Model, Model], tmp_path: Path
         export_run(tmp_path)
     for path in (folder / "checkpoints").iterdir():
         path.unlink()
-    with pytest.raises(UserError, match=r"checkpoints: no checkpoint"):
+    with pytest.raises(UserError, match=r"arm: has no checkpoint yet: nothing to export"):
         export_run(folder)
     assert not (folder / "bundle").exists()
 
@@ -146,3 +146,37 @@ def test_a_description_that_cannot_be_written_is_one_line(tmp_path: Path) -> Non
     encoder = ConvolutionalEncoder(SPEC, features=8, channels=2, strides=[2])
     with pytest.raises(UserError, match="cannot be written"):
         write_model_description(tmp_path / "file" / "run", encoder, Identity(8), training={}, data={})
+
+
+@pytest.mark.parametrize("precision", [torch.bfloat16, torch.float64])
+def test_a_run_of_another_precision_is_exported_as_float32(run: tuple[Path, Model, Model], precision: Any) -> None:
+    folder, _, model = run
+    write_checkpoint(folder, 9, (model[0].to(precision), model[1].to(precision)))
+    frozen, observations = load_encoder(export_run(folder)), example_batch(SPEC, 6)
+    assert {p.dtype for p in frozen.parameters()} == {torch.float32}
+    assert frozen.description["training"]["steps"] == 9
+    expected = latents((model[0].to(torch.float32), model[1].to(torch.float32)), observations)
+    assert torch.equal(frozen.encode(observations), expected)
+
+
+def test_damaged_checkpoints_alone_are_nothing_to_export(run: tuple[Path, Model, Model]) -> None:
+    for path in (run[0] / "checkpoints").iterdir():
+        path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(UserError, match="arm: all its checkpoints are damaged: nothing to export"):
+        export_run(run[0])
+
+
+def test_a_run_in_place_of_its_bundle_is_told(run: tuple[Path, Model, Model]) -> None:
+    with pytest.raises(UserError, match=r"arm: is a run: export it \(.* export .*arm\)"):
+        load_encoder(run[0])
+    export_run(run[0])
+    with pytest.raises(UserError, match=r"arm: is a run: name its bundle, .*arm/bundle"):
+        load_encoder(run[0])
+
+
+def test_formats_are_a_word_or_words_between_commas(run: tuple[Path, Model, Model], tmp_path: Path) -> None:
+    assert (export_run(run[0], tmp_path / "p", formats="safetensors,pt2") / "model.pt2").is_file()
+    for formats, words in (("pt3", "unknown export format 'pt3'.*pt2"), (",", "formats: expected a word")):
+        with pytest.raises(UserError, match=words):
+            export_run(run[0], tmp_path / "q", formats=formats)
+    assert not (tmp_path / "q").exists()
