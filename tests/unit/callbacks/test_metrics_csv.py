@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import csv
+import os
+
+import pytest
 
 from repdib_lightning.callbacks.metrics_csv import MetricsCSV
 
@@ -44,3 +47,21 @@ def test_a_line_cut_by_a_kill_is_dropped(tmp_path):
 def test_a_new_run_starts_empty(tmp_path):
     log(MetricsCSV(tmp_path / "run"), 0, loss=1.0)
     assert len(rows(tmp_path / "run" / "metrics.csv")) == 1
+
+
+@pytest.mark.parametrize("moment", ["while it is opened again", "while a new column is added"])
+def test_a_kill_loses_nothing(tmp_path, monkeypatch, moment):
+    class Killed(BaseException):
+        pass
+
+    def kill(*_):
+        raise Killed
+
+    folder = tmp_path / "run"
+    for step in range(3):
+        log(first := MetricsCSV(folder, resumed_step=step), step, loss=1.0)
+    before = (folder / "metrics.csv").read_text()
+    monkeypatch.setattr(os, "replace", kill)
+    with pytest.raises(Killed):
+        log(MetricsCSV(folder, resumed_step=3) if "opened" in moment else first, 3, accuracy=0.5)
+    assert (folder / "metrics.csv").read_text() == before
