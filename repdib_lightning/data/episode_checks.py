@@ -98,7 +98,7 @@ def check_stated(
             raise UserError(f"{path}: {what}")
 
     demand(_counts(episodes) and _counts(rows) and rows >= episodes, f"rows={rows!r}, episodes={episodes!r}: " + _ROWS)
-    groups = {"observations": observations, "factors": factors, "masks": masks}
+    groups: dict[str, Any] = {"observations": observations, "factors": factors, "masks": masks}
     for group, specs in groups.items():
         demand(isinstance(specs, Mapping), f"{group} must be a dict, is {type(specs).__name__}")
         for name in specs:
@@ -206,7 +206,7 @@ def check_episode(where: str, columns: dict[str, Column], given: dict[str, Any])
 
 def flat(where: str, groups: dict[str, Any], arrays: dict[str, Any]) -> dict[str, Any]:
     """Arguments of ``add_episode`` by key in the store; what is None was not handed in."""
-    given = {}
+    given: dict[str, Any] = {}
     for group, members in groups.items():
         if members is not None and not isinstance(members, Mapping):
             raise UserError(f"{where}: {group} is of type {type(members).__name__}; expected a dict of numpy arrays")
