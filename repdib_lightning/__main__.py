@@ -46,9 +46,9 @@ def run(arguments: list[str]) -> int:
     verb, rest = arguments[0], arguments[1:]
     if verb not in VERBS:
         raise UserError(f"unknown verb '{verb}': {nearest(verb, VERBS)}")
-    # Threads that spin while they wait cost half the speed wherever the machine has something else to do. The OpenMP
-    # runtime reads this when torch is first imported, which is after this line.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Threads that spin long while they wait for each other cost half the speed wherever the machine has something else
+    # to do; a short spin costs nothing where it has not. GNU's OpenMP reads this when torch is first imported.
+    os.environ.setdefault("GOMP_SPINCOUNT", "5000")
     module, _, function = VERBS[verb][0].partition(":")
     return int(getattr(importlib.import_module(module), function)(rest) or 0)
 
