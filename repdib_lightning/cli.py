@@ -65,7 +65,7 @@ class TrainingCLI(LightningCLI):
     """LightningCLI with a run folder: ``--run`` names a new one, ``--resume`` goes on with one."""
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Add the two options of the run folder."""
+        """Add the options of the run folder and its checkpoints."""
         parser.add_argument("--run", type=str | None, default=None, help="Folder of the run. Default: runs/NAME-DATE.")
         parser.add_argument(
             "--resume", type=str | None, default=None, help="Folder of a run to go on with, exactly where it stopped."
@@ -153,8 +153,8 @@ def _open(cli: TrainingCLI) -> None:
         check_same_data(cli.folder, cli.datamodule.store)
     cli.datamodule.train_dataloader()
     with _one_line_errors(cli.parser):
-        cli.model.build(cli.datamodule.spec).rehearse(cli.datamodule.example())
-        cli.model.configure_optimizers()
+        cli.model.build(cli.datamodule.spec).configure_optimizers()
+    cli.model.rehearse(cli.datamodule.example())  # an error in somebody's own part keeps its traceback
     run_folder.open_run(cli.folder, configuration, cli.datamodule.store, resumed=resumed)
     if not resumed:
         _describe_model(cli)

@@ -132,14 +132,13 @@ def write_comparison(output: Path, runs: Mapping[str, RunResult], store: Episode
     output = Path(output)
     reports = {name: run.report for name, run in runs.items()}
     plain = json.dumps({name: report.to_dict() for name, report in reports.items()}, indent=2, allow_nan=False)
-    page = render_page(title, comparison_sections(runs, store))
+    sections = comparison_sections(runs, store)
     numbers, bars = beside(output)
     with whole_file(numbers) as aside:
         aside.write_text(plain + "\n")
     with whole_file(bars) as aside:
         aside.write_bytes(figures.kept_bars(reports))
-    with whole_file(output) as aside:
-        aside.write_text(page, encoding="utf-8")
+    write_report(output, title, sections)
 
 
 def write_report(path: Path, title: str, sections: list[Section]) -> None:
