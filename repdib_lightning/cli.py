@@ -15,6 +15,7 @@ import lightning.pytorch as pl
 import torch
 from jsonargparse import Namespace
 from jsonargparse.typing import PositiveInt
+from lightning.fabric.utilities.seed import reset_seed
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -123,6 +124,7 @@ def fit(arguments: list[str]) -> int:
         return 0
     _open(cli)
     _say(f"run folder: {cli.folder}")
+    reset_seed()  # as Lightning does where several processes train: one process draws what they will
     try:
         with exit_codes(), _one_line_errors(cli.parser, _SETUP_ERRORS):
             cli.trainer.fit(cli.model, datamodule=cli.datamodule, ckpt_path=cli.checkpoint)

@@ -14,11 +14,14 @@ from repdib_lightning.bottlenecks.base import Bottleneck
 from repdib_lightning.encoders.augmentation import random_shift
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.means import SampleMeans
 from repdib_lightning.objectives.base import Objective
 from repdib_lightning.records import Batch, BottleneckOutput, DataSpec, ObjectiveOutput
 
 DEFAULT_LOSS_WEIGHTS = {"kl": 0.01, "commitment": 0.25}
 """Paper: VIB coefficient 0.01 (all three tables); VQ-VAE: commitment 0.25. Every other term weighs 1."""
+_SHOWN = ("loss", "action_accuracy")
+"""What the progress bar shows."""
 
 
 class RepresentationModule(pl.LightningModule):
@@ -61,6 +64,7 @@ class RepresentationModule(pl.LightningModule):
         self.named_weights = sorted({*(loss_weights or {}), *(warmup or {})})
         self.warmup = warmup or {}
         self.shift = shift
+        self._held_out = SampleMeans()
         if shift < 0:
             raise UserError(f"model.shift must not be negative, is {shift}")
 
@@ -113,21 +117,29 @@ class RepresentationModule(pl.LightningModule):
         output = self._evaluate(batch)
         terms = {name: value * self._weight(name) for name, value in output.losses.items()}
         loss = torch.stack(list(terms.values())).sum()
-        self._log("train", batch, loss, output, terms)
+        self._log(_named("train", loss, output, terms))
         return {"loss": loss, "terms": {name: value.detach() for name, value in output.losses.items()}}
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
-        """Log the same terms for held-out episodes."""
-        self._log_held_out("val", batch)
+        """Collect the same terms for held-out episodes."""
+        self._add_held_out("val", batch)
 
     def test_step(self, batch: Batch, batch_index: int) -> None:
-        """Log the same terms for held-out episodes."""
-        self._log_held_out("test", batch)
+        """Collect the same terms for held-out episodes."""
+        self._add_held_out("test", batch)
 
-    def _log_held_out(self, stage: str, batch: Batch) -> None:
+    def on_validation_epoch_end(self) -> None:
+        """Log their means over all samples of all processes."""
+        self._log(self._held_out.take())
+
+    def on_test_epoch_end(self) -> None:
+        """Log their means over all samples of all processes."""
+        self._log(self._held_out.take())
+
+    def _add_held_out(self, stage: str, batch: Batch) -> None:
         output = self._evaluate(batch)
         terms = {name: value * self.loss_weights.get(name, 1.0) for name, value in output.losses.items()}
-        self._log(stage, batch, torch.stack(list(terms.values())).sum(), output, terms)
+        self._held_out.add(_named(stage, torch.stack(list(terms.values())).sum(), output, terms), len(batch))
 
     def _evaluate(self, batch: Batch) -> ObjectiveOutput:
         """All unweighted losses and metrics of one batch; the objective encodes exactly once."""
@@ -156,20 +168,14 @@ class RepresentationModule(pl.LightningModule):
         share = min(1.0, (self.global_step + 1) / steps) if steps else 1.0
         return self.loss_weights.get(name, 1.0) * share
 
-    def _log(self, stage: str, batch: Batch, loss: Tensor, output: ObjectiveOutput, terms: dict[str, Tensor]) -> None:
-        values = {f"{stage}/loss": loss.detach()}
-        values |= {f"{stage}/raw/{name}": value.detach() for name, value in output.losses.items()}
-        values |= {f"{stage}/weighted/{name}": value.detach() for name, value in terms.items()}
-        values |= {f"{stage}/{name}": value for name, value in output.metrics.items()}
-        held_out = stage != "train"
-        shown = {f"{stage}/loss", f"{stage}/action_accuracy"}
+    def _log(self, values: dict[str, Tensor]) -> None:
         for name, value in values.items():
-            self.log(
-                name,
-                value,
-                prog_bar=name in shown,
-                on_step=not held_out,
-                on_epoch=held_out,
-                batch_size=len(batch),
-                sync_dist=held_out,
-            )
+            self.log(name, value, prog_bar=name.partition("/")[2] in _SHOWN)
+
+
+def _named(stage: str, loss: Tensor, output: ObjectiveOutput, terms: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Everything that is logged of one batch, under the same names everywhere."""
+    values = {f"{stage}/loss": loss.detach()}
+    values |= {f"{stage}/raw/{name}": value.detach() for name, value in output.losses.items()}
+    values |= {f"{stage}/weighted/{name}": value.detach() for name, value in terms.items()}
+    return values | {f"{stage}/{name}": value for name, value in output.metrics.items()}

@@ -8,10 +8,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from repdib_lightning.bottlenecks.kmeans import nearest_codes
+from repdib_lightning.bottlenecks.nearest import nearest_codes
 from repdib_lightning.bottlenecks.precision import SinglePrecision
-from repdib_lightning.bottlenecks.processes import sum_over_processes, take_from_first
 from repdib_lightning.errors import UserError
+from repdib_lightning.processes import pick_rows, process_count, sum_over_processes, take_from_first
 
 _SMOOTHING = 1e-5
 
@@ -26,8 +26,8 @@ class Codebook(SinglePrecision):
     over all processes at each step, float32 whatever the precision of the network.
 
     A code that no row of any process has chosen for ``revive_after`` training steps is moved onto a random row of the
-    batch of process 0. Its sum and count are set to that row, so that the update of the same step and of those after
-    it continue from there. 0 switches this off.
+    batch of all processes. Its sum and count are set to that row, so that the update of the same step and of those
+    after it continue from there. 0 switches this off.
 
     Attributes:
         vectors: (P, L, D), parameter or buffer.
@@ -62,10 +62,13 @@ class Codebook(SinglePrecision):
         """Index of the nearest code of each row, (R, P) int64."""
         return nearest_codes(rows.transpose(0, 1), self.vectors).transpose(0, 1)
 
+    def flat(self, indices: Tensor) -> Tensor:
+        """(R, P) indices counted through all books, book * L + code: (R * P,)."""
+        return (indices + self.first).flatten()
+
     def look_up(self, indices: Tensor) -> Tensor:
         """The codes behind (R, P) indices, (R, P, D)."""
-        flat = self.vectors.flatten(0, 1).index_select(0, (indices + self.first).flatten())
-        return flat.view(*indices.shape, -1)
+        return self.vectors.flatten(0, 1).index_select(0, self.flat(indices)).view(*indices.shape, -1)
 
     @torch.no_grad()
     def place(self, centres: Tensor, shares: Tensor, rows: int) -> None:
@@ -80,39 +83,47 @@ class Codebook(SinglePrecision):
             self.sums.copy_(self.vectors * self.sizes.unsqueeze(-1))
 
     @torch.no_grad()
-    def follow(self, rows: Tensor, indices: Tensor) -> None:
-        """Update what a training step changes: running averages, idle times, dead codes."""
-        if self.rule == "gradient" and not self.revive_after:
-            return
-        counts = self._tally(rows, indices)
+    def follow(self, rows: Tensor, chosen: Tensor, counts: Tensor) -> None:
+        """Update what a training step changes: running averages, idle times, dead codes.
+
+        Args:
+            rows: (R, P, D) of this process, as all that follows.
+            chosen: (R * P,), the code of each row, see :meth:`flat`.
+            counts: (P, L), rows that chose each code.
+        """
+        if self.rule == "ema":
+            counts = self._average(rows, chosen, counts)
+        elif self.revive_after:
+            counts = sum_over_processes(counts.clone())
         if self.revive_after:
             self._revive(rows, counts)
 
-    def _tally(self, rows: Tensor, indices: Tensor) -> Tensor:
-        """Count (P, L) the rows of all processes that chose each code, and move the ``ema`` codes by them."""
+    def _average(self, rows: Tensor, chosen: Tensor, counts: Tensor) -> Tensor:
+        """Move the codes by the rows of all processes, and return the counts of all processes."""
         books, codes, size = self.vectors.shape
-        flat = (indices + self.first).flatten()
-        ema = self.rule == "ema"
-        tally = rows.new_zeros(books * codes, size + 1 if ema else 1)
-        ones = rows.new_ones(len(flat), 1)
-        tally.index_add_(0, flat, torch.cat([rows.reshape(-1, size), ones], dim=1) if ema else ones)
-        tally = sum_over_processes(tally).view(books, codes, -1)
-        counts = tally[..., -1]
-        if ema:
-            self.sizes.lerp_(counts, 1 - self.decay)
-            self.sums.lerp_(tally[..., :-1], 1 - self.decay)
-            total = self.sizes.sum(-1, keepdim=True)
-            smooth = (self.sizes + _SMOOTHING) / (total + codes * _SMOOTHING) * total
-            self.vectors.copy_(self.sums / smooth.unsqueeze(-1))
-        return counts
+        tally = rows.new_zeros(books * codes * (size + 1))  # in one piece, so that one exchange carries both
+        sums, total = tally[: books * codes * size].view(-1, size), tally[books * codes * size :].view(books, codes)
+        sums.index_add_(0, chosen, rows.reshape(-1, size))
+        total.copy_(counts)
+        sum_over_processes(tally)
+        self.sizes.lerp_(total, 1 - self.decay)
+        self.sums.lerp_(sums.view_as(self.sums), 1 - self.decay)
+        mass = self.sizes.sum(-1, keepdim=True)
+        smooth = (self.sizes + _SMOOTHING) / (mass + codes * _SMOOTHING) * mass
+        torch.div(self.sums, smooth.unsqueeze(-1), out=self.vectors)
+        return total
 
     def _revive(self, rows: Tensor, counts: Tensor) -> None:
         codes = self.vectors.shape[1]
-        self.idle.copy_(torch.where(counts > 0, 0, self.idle + 1))
+        self.idle.add_(1).masked_fill_(counts > 0, 0)
         dead = self.idle >= self.revive_after
-        drawn = torch.randperm(len(rows), device=rows.device)
-        drawn = drawn[torch.arange(codes, device=rows.device) % len(rows)]
-        fresh = take_from_first(rows[drawn].transpose(0, 1).contiguous())
+        # A question to a GPU would wait for it, and one to a compiler would break its graph: they move what is dead,
+        # be it nothing.
+        if not torch.compiler.is_compiling() and dead.device.type == "cpu" and not dead.any():
+            return
+        drawn = torch.randperm(len(rows) * process_count(), device=rows.device)
+        drawn = drawn[torch.arange(codes, device=rows.device) % len(drawn)]
+        fresh = pick_rows(rows, take_from_first(drawn)).transpose(0, 1)
         self.vectors.copy_(torch.where(dead.unsqueeze(-1), fresh, self.vectors))
         self.idle.masked_fill_(dead, 0)
         if self.rule == "ema":
@@ -151,3 +162,13 @@ def perplexity(counts: Tensor) -> Tensor:
     shares = counts / counts.sum(-1, keepdim=True).clamp(min=1)
     entropy: Tensor = torch.special.entr(shares).sum(-1)
     return entropy.exp()
+
+
+def describe_use(counts: Tensor) -> dict[str, Tensor]:
+    """Metrics of a (G, L) histogram: perplexity (mean and lowest over groups), and used codes (mean over groups)."""
+    effective = perplexity(counts)
+    return {
+        "perplexity": effective.mean(),
+        "perplexity_min": effective.min(),
+        "used_codes": (counts > 0).sum(-1, dtype=counts.dtype).mean(),
+    }

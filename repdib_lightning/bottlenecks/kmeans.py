@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_SCORES_AT_ONCE = 4_000_000
+from repdib_lightning.bottlenecks.nearest import nearest_codes
 
 
 @torch.no_grad()
@@ -24,7 +24,7 @@ def kmeans(points: Tensor, clusters: int, *, iterations: int = 10) -> tuple[Tens
     counts = points.new_zeros(groups, clusters)
     first = torch.arange(groups, device=points.device).unsqueeze(1) * clusters
     for _ in range(iterations):
-        flat = (assign_in_chunks(points, centres) + first).flatten()
+        flat = (nearest_codes(points, centres) + first).flatten()
         counts = points.new_zeros(groups * clusters).index_add_(0, flat, points.new_ones(groups * rows))
         counts = counts.view(groups, clusters)
         sums = points.new_zeros(groups * clusters, size).index_add_(0, flat, points.reshape(-1, size))
@@ -52,18 +52,3 @@ def spread_seeds(points: Tensor, clusters: int) -> Tensor:
         chosen = (distance / torch.empty_like(distance).exponential_()).argmax(-1)
         seeds.append(points[every_group, chosen])
     return torch.stack(seeds, dim=1)
-
-
-def nearest_codes(points: Tensor, codes: Tensor) -> Tensor:
-    """Index of the nearest code (Euclidean): points (P, R, D), codes (P, L, D) -> (P, R) int64.
-
-    |z|^2 is the same for all codes and is left out; ``torch.cdist`` is avoided because it breaks ``torch.export``.
-    """
-    squares = codes.square().sum(-1).unsqueeze(1)
-    return torch.baddbmm(squares, points, codes.transpose(1, 2), alpha=-2).min(-1).indices
-
-
-def assign_in_chunks(points: Tensor, codes: Tensor) -> Tensor:
-    """:func:`nearest_codes` with bounded memory, for many points."""
-    rows = max(1, _SCORES_AT_ONCE // (codes.shape[0] * codes.shape[1]))
-    return torch.cat([nearest_codes(chunk, codes) for chunk in points.split(rows, dim=1)], dim=1)

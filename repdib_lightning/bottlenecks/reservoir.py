@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from repdib_lightning.bottlenecks.precision import SinglePrecision
-from repdib_lightning.bottlenecks.processes import gather_rows
+from repdib_lightning.processes import gather_rows
 
 
 class Reservoir(SinglePrecision):
@@ -30,18 +30,16 @@ class Reservoir(SinglePrecision):
 
     @torch.no_grad()
     def add(self, latent: Tensor) -> None:
-        """Store (N, M), in place of the oldest rows."""
+        """Store the (N, M) of all processes, in place of the oldest rows: each process keeps the same."""
         capacity = len(self.rows)
-        latent = latent[-capacity:]
+        latent = gather_rows(latent)[-capacity:]
         places = (self.seen + torch.arange(len(latent), device=latent.device)) % capacity
         self.rows.index_copy_(0, places, latent.to(self.rows.dtype))
         self.seen += len(latent)
 
     def collect(self) -> Tensor:
-        """Rows of all processes, at most R, (R', M): the same number from each where they hold the same number."""
-        capacity = len(self.rows)
-        rows = gather_rows(self.rows[: min(capacity, int(self.seen))])
-        return rows[:: -(-len(rows) // capacity)]
+        """The rows added so far, at most R: (R', M)."""
+        return self.rows[: int(self.seen)]
 
     def release(self) -> None:
         """Forget the rows and free their memory."""

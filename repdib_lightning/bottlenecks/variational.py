@@ -12,6 +12,7 @@ from torch.nn import functional
 from repdib_lightning.bottlenecks.base import Bottleneck
 from repdib_lightning.bottlenecks.precision import at_least_single, without_autocast
 from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.processes import own_rows, rows_of_all
 from repdib_lightning.records import BottleneckOutput
 
 _HEADS = ("linear", "split")
@@ -108,7 +109,7 @@ class Variational(Bottleneck):
             sigma = torch.exp(0.5 * log_variance)
             kl = standard_normal_kl(mean, log_variance)
             centre = self.head.back(mean)
-            sample = self.head.back(mean + sigma * torch.randn_like(mean)) if self.training else centre
+            sample = self.head.back(mean + sigma * _noise(mean)) if self.training else centre
         nats = kl.sum(-1).mean()
         metrics = {
             "kl_nats": nats.detach(),
@@ -117,6 +118,12 @@ class Variational(Bottleneck):
         }
         losses = {"kl": nats if self.kl_reduction == "sum" else kl.mean()}
         return sample, centre, BottleneckOutput(sample, losses, metrics=metrics)
+
+
+def _noise(like: Tensor) -> Tensor:
+    """Standard normal noise of the shape (N, M) of ``like``."""
+    drawn = torch.randn(rows_of_all(len(like)), like.shape[1], dtype=like.dtype, device=like.device)
+    return own_rows(drawn)
 
 
 class LinearHead(nn.Module):

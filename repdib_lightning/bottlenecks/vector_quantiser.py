@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from repdib_lightning.bottlenecks.base import Bottleneck
-from repdib_lightning.bottlenecks.codebook import Codebook, count_codes, perplexity
+from repdib_lightning.bottlenecks.codebook import Codebook, count_codes, describe_use
 from repdib_lightning.bottlenecks.kmeans import kmeans
 from repdib_lightning.bottlenecks.precision import without_autocast
-from repdib_lightning.bottlenecks.processes import process_count
 from repdib_lightning.bottlenecks.reservoir import Reservoir
+from repdib_lightning.bottlenecks.straight_through import replace_by_codes
 from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.processes import own_rows, process_count, rows_of_all
 from repdib_lightning.records import BottleneckOutput
 
 _RULES = ("ema", "gradient")
@@ -137,31 +138,21 @@ class VectorQuantiser(Bottleneck):
         return codes.reshape(-1, len(self.book.vectors))
 
     def _quantise(self, latent: Tensor) -> BottleneckOutput:
-        rows = latent.reshape(-1, *self.book.vectors.shape[::2])
+        rows = latent.detach().reshape(-1, *self.book.vectors.shape[::2])
         indices = self.book.assign(rows)
-        chosen = self.book.look_up(indices).view_as(latent)
-        losses = {"commitment": (latent - chosen.detach()).square().mean()}
+        chosen = self.book.flat(indices)
+        quantised, commitment, codebook = replace_by_codes(latent, self.book.vectors, chosen)
+        losses = {"commitment": commitment}
         if self.book.rule == "gradient":
-            losses["codebook"] = (chosen - latent.detach()).square().mean()
-        # The difference is exactly 0, so that the latent is exactly the code and the gradient that of the identity.
-        passed = chosen.detach() + (latent - latent.detach())
-        if self.training:
-            self.book.follow(rows.detach(), indices)
-            if self.bypass:
-                bypassed = torch.rand(len(latent), 1, device=latent.device) < self.bypass
-                passed = torch.where(bypassed, latent, passed)
+            losses["codebook"] = codebook
         codes = indices.reshape(-1, self.groups)
-        return BottleneckOutput(passed, losses, codes, self._describe_use(codes))
-
-    @torch.no_grad()
-    def _describe_use(self, codes: Tensor) -> dict[str, Tensor]:
         counts = count_codes(codes, self.codes)
-        effective = perplexity(counts)
-        return {
-            "perplexity": effective.mean(),
-            "perplexity_min": effective.min(),
-            "used_codes": (counts > 0).sum(-1).float().mean(),
-        }
+        if self.training:
+            self.book.follow(rows, chosen, counts.sum(0, keepdim=True) if self.shared else counts)
+            if self.bypass:
+                drawn = torch.rand(rows_of_all(len(latent)), 1, device=latent.device)
+                quantised = torch.where(own_rows(drawn) < self.bypass, latent, quantised)
+        return BottleneckOutput(quantised, losses, codes, describe_use(counts))
 
     def _pass_through(self, latent: Tensor) -> BottleneckOutput:
         zero = torch.zeros((), dtype=self.book.vectors.dtype, device=latent.device)

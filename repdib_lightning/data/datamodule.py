@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from repdib_lightning.data.episodes import EpisodeStore
-from repdib_lightning.data.loading import FutureFrames, ResumableLoader, as_it_is
+from repdib_lightning.data.loading import FutureFrames, ResumableLoader, as_it_is, evaluation_batches
 from repdib_lightning.data.sampling import FutureSampling
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.records import ArraySpec, Batch, DataSpec, Split
@@ -100,10 +100,7 @@ class EpisodeDataModule(pl.LightningDataModule):
     def val_dataloader(self) -> DataLoader[Batch]:
         """Anchors of the evaluation episodes, each once, in the same order each time."""
         dataset = self._frames(self._evaluation)
-        rank, world_size = self._place()
-        numbers = range(rank, len(dataset), world_size)
-        share = max(1, self.batch_size // world_size)
-        batches = [list(numbers[i : i + share]) for i in range(0, len(numbers), share)]
+        batches = evaluation_batches(len(dataset), self.batch_size, *self._place())
         return DataLoader(dataset, batch_sampler=batches, collate_fn=as_it_is, num_workers=self.workers)
 
     def test_dataloader(self) -> DataLoader[Batch]:

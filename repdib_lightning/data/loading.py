@@ -53,8 +53,8 @@ class ResumableLoader:
     """An endless stream of batches, cut into epochs, that continues where its state says.
 
     Batch b of epoch e holds the samples ``e * len(dataset) + b * batch_size + ...`` of the stream; with several ranks
-    each takes a strided slice of every global batch, so that together they see what one process would. The last,
-    incomplete batch of an epoch is left out. Worker processes live on from epoch to epoch.
+    each takes a contiguous part of every global batch, so that together they see what one process would, in its order.
+    The last, incomplete batch of an epoch is left out. Worker processes live on from epoch to epoch.
 
     Args:
         dataset: indexed by lists of sample numbers.
@@ -137,11 +137,27 @@ class _SampleNumbers:
     def __iter__(self) -> Iterator[list[int]]:
         loader, epoch, batch = self.loader, self.epoch, self.batch
         while True:
-            first = epoch * len(loader.dataset) + batch * loader.batch_size
-            yield list(range(first + loader.rank, first + loader.batch_size, loader.world_size))
+            share = loader.batch_size // loader.world_size
+            first = epoch * len(loader.dataset) + batch * loader.batch_size + loader.rank * share
+            yield list(range(first, first + share))
             batch += 1
             if batch == len(loader):
                 epoch, batch = epoch + 1, 0
+
+
+def evaluation_batches(samples: int, batch_size: int, rank: int = 0, world_size: int = 1) -> list[list[int]]:
+    """Sample numbers of each batch of one process, which together hold every sample once.
+
+    Each process has as many batches as the others, of sizes that differ by one at most: none is padded, and none waits
+    for another that has ended.
+
+    Raises:
+        UserError: fewer samples than processes.
+    """
+    if samples < world_size:
+        raise UserError(f"the held-out episodes have {samples} samples, too few for {world_size} processes")
+    count = min(-(-samples // batch_size), samples // world_size)
+    return [part.tolist() for part in np.array_split(np.arange(rank, samples, world_size), count)]
 
 
 def as_it_is(batch: Any) -> Any:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from repdib_lightning.processes import own_rows, rows_of_all
+
 
 def random_shift(image: Tensor, pad: int) -> Tensor:
     """Move each picture by up to ``pad`` pixels in both directions; the border is repeated outwards.
@@ -19,7 +21,7 @@ def random_shift(image: Tensor, pad: int) -> Tensor:
     if pad == 0:
         return image
     count, _, height, width = image.shape
-    shift = torch.randint(-pad, pad + 1, (2, count, 1), device=image.device)
+    shift = own_rows(torch.randint(-pad, pad + 1, (2, rows_of_all(count), 1), device=image.device), dim=1)
     rows = (torch.arange(height, device=image.device) + shift[0]).clamp_(0, height - 1)
     columns = (torch.arange(width, device=image.device) + shift[1]).clamp_(0, width - 1)
     pictures = torch.arange(count, device=image.device)[:, None, None]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import socket
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +30,9 @@ class KillAfter(Callback):
             os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _child(folder: str, arguments: list[str]) -> None:
+def _child(folder: str, arguments: list[str], environment: dict[str, str]) -> None:
     os.chdir(folder)
+    os.environ.update(environment)
     import torch
 
     from repdib_lightning.__main__ import main
@@ -44,10 +47,29 @@ def _child(folder: str, arguments: list[str]) -> None:
 
 def command(folder: Path, *arguments: str) -> int:
     """Run ``python -m repdib_lightning ARGUMENTS`` in a folder; return its exit code (negative: killed)."""
+    return _join([_start(folder, arguments, {})])[0]
+
+
+def command_in_processes(count: int, folder: Path, *arguments: str) -> list[int]:
+    """The same in several processes that train together, with the environment that torchrun gives them."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "TORCHELASTIC_RUN_ID": "test"}
+    sizes = {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count), "GROUP_RANK": "0"}
+    ranks = [{"RANK": str(rank), "LOCAL_RANK": str(rank)} for rank in range(count)]
+    return _join([_start(folder, arguments, {**shared, **sizes, **rank}) for rank in ranks])
+
+
+def _start(folder: Path, arguments: Sequence[str], environment: dict[str, str]) -> Any:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["repdib_lightning.cli", "killing"])
-    process = context.Process(target=_child, args=(str(folder), list(arguments)))
+    process = context.Process(target=_child, args=(str(folder), list(arguments), environment))
     process.start()
-    process.join()
-    assert process.exitcode is not None
-    return process.exitcode
+    return process
+
+
+def _join(processes: Sequence[Any]) -> list[int]:
+    for process in processes:
+        process.join()
+    return [process.exitcode for process in processes]

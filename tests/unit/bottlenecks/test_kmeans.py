@@ -1,6 +1,6 @@
 import torch
 
-from repdib_lightning.bottlenecks.kmeans import assign_in_chunks, kmeans, nearest_codes, spread_seeds
+from repdib_lightning.bottlenecks.kmeans import kmeans, spread_seeds
 
 
 def blobs(groups, clusters, rows):
@@ -56,9 +56,3 @@ def test_seeds_are_points():
         matches = (seeds[group].unsqueeze(1) == points[group].unsqueeze(0)).all(-1)
         assert matches.any(1).all()
         assert len(seeds[group].unique(dim=0)) == 10
-
-
-def test_chunks_change_nothing(monkeypatch):
-    points, codes = torch.randn(2, 100, 4), torch.randn(2, 7, 4)
-    monkeypatch.setattr("repdib_lightning.bottlenecks.kmeans._SCORES_AT_ONCE", 200)
-    assert torch.equal(assign_in_chunks(points, codes), nearest_codes(points, codes))

@@ -8,7 +8,7 @@ import torch
 
 from repdib_lightning.data.datamodule import EpisodeDataModule
 from repdib_lightning.data.episodes import EpisodeStore
-from repdib_lightning.data.loading import FutureFrames, ResumableLoader
+from repdib_lightning.data.loading import FutureFrames, ResumableLoader, evaluation_batches
 from repdib_lightning.data.sampling import FutureSampling, gather_stacks, stacked_rows
 from repdib_lightning.errors import UserError
 
@@ -116,7 +116,21 @@ def test_ranks_together_see_what_one_process_sees(store):
     alone = rows_of(loader(store))
     shares = [rows_of(loader(store, rank=rank, world_size=2)) for rank in range(2)]
     for whole, left, right in zip(alone, *shares, strict=True):
-        assert whole[0::2] == left and whole[1::2] == right
+        assert whole == left + right
+
+
+@pytest.mark.parametrize(("samples", "batch_size", "ranks"), [(19, 8, 1), (19, 8, 2), (7, 4, 3), (24, 8, 2), (3, 8, 3)])
+def test_evaluation_holds_every_sample_once_in_equally_many_batches(samples, batch_size, ranks):
+    shares = [evaluation_batches(samples, batch_size, rank, ranks) for rank in range(ranks)]
+    assert sorted(number for share in shares for batch in share for number in batch) == list(range(samples))
+    assert len({len(share) for share in shares}) == 1
+    sizes = [len(batch) for share in shares for batch in share]
+    assert min(sizes) > 0 and max(sizes) * ranks < batch_size + ranks
+
+
+def test_fewer_held_out_samples_than_processes():
+    with pytest.raises(UserError, match="1 samples, too few for 2 processes"):
+        evaluation_batches(1, 8, 0, 2)
 
 
 def test_changed_batch_size_is_refused_on_resume(store):

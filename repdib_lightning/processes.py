@@ -45,3 +45,32 @@ def gather_rows(rows: Tensor) -> Tensor:
     parts = [torch.empty_like(padded) for _ in range(len(counts))]
     distributed.all_gather(parts, padded)
     return torch.cat([part[:count] for part, count in zip(parts, counts.tolist(), strict=True)])
+
+
+def rows_of_all(count: int) -> int:
+    """How many rows all processes have, where this one has ``count`` and each has as many."""
+    return count * process_count()
+
+
+def own_rows(drawn: Tensor, dim: int = 0) -> Tensor:
+    """Cut the share of this process out of what was drawn for the rows of all.
+
+    Noise belongs to the sample, not to the process: each draws the noise of the whole batch from the same generator
+    state and keeps its own part, so that several processes train on what one would have trained on.
+    """
+    if not several_processes():
+        return drawn
+    return drawn.tensor_split(distributed.get_world_size(), dim)[distributed.get_rank()]
+
+
+def pick_rows(rows: Tensor, wanted: Tensor) -> Tensor:
+    """Rows at ``wanted`` (K,) int64, counted through the equally many rows (R, ...) of each process: (K, ...).
+
+    All processes must want the same.
+    """
+    if not several_processes():
+        return rows[wanted]
+    here = wanted - distributed.get_rank() * len(rows)
+    held = (here >= 0) & (here < len(rows))
+    picked = rows[here.clamp(0, len(rows) - 1)].masked_fill(~held.view(-1, *[1] * (rows.ndim - 1)), 0.0)
+    return sum_over_processes(picked)
