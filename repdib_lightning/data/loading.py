@@ -104,7 +104,7 @@ class ResumableLoader:
     def _open(self) -> DataLoader[Batch]:
         return DataLoader(
             self.dataset,
-            batch_sampler=_SampleNumbers(self, self.epoch, self.batch),
+            batch_sampler=_SampleNumbers(self),
             num_workers=self.workers,
             collate_fn=as_it_is,
             pin_memory=self.pin_memory,
@@ -129,19 +129,25 @@ class ResumableLoader:
 
 
 class _SampleNumbers:
-    """Endless lists of this rank's sample numbers from a given batch on."""
+    """Endless lists of a rank's sample numbers from a given batch on.
 
-    def __init__(self, loader: ResumableLoader, epoch: int, batch: int) -> None:
-        self.loader, self.epoch, self.batch = loader, epoch, batch
+    It keeps numbers and not the loader: a loader that its own stream refers to would be freed by the garbage collector,
+    whose order of finalisers leaves worker processes waiting for seconds.
+    """
+
+    def __init__(self, loader: ResumableLoader) -> None:
+        self.samples, self.batches, self.batch_size = len(loader.dataset), len(loader), loader.batch_size
+        self.share = loader.batch_size // loader.world_size
+        self.offset = loader.rank * self.share
+        self.epoch, self.batch = loader.epoch, loader.batch
 
     def __iter__(self) -> Iterator[list[int]]:
-        loader, epoch, batch = self.loader, self.epoch, self.batch
+        epoch, batch = self.epoch, self.batch
         while True:
-            share = loader.batch_size // loader.world_size
-            first = epoch * len(loader.dataset) + batch * loader.batch_size + loader.rank * share
-            yield list(range(first, first + share))
+            first = epoch * self.samples + batch * self.batch_size + self.offset
+            yield list(range(first, first + self.share))
             batch += 1
-            if batch == len(loader):
+            if batch == self.batches:
                 epoch, batch = epoch + 1, 0
 
 
