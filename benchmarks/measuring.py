@@ -28,8 +28,25 @@ def wait(device: str) -> None:
         torch.cuda.synchronize()
 
 
-def alternate(contenders: Contenders, rounds: int = 20, warmup: int = 2, device: str = "cpu") -> dict[str, float]:
-    """Median seconds of each contender; every round times each once, in turn, and the order rotates."""
+class Times(dict[str, float]):
+    """Median seconds of each contender, and the times of every round.
+
+    Attributes:
+        rounds: name -> seconds of each round; the same place is the same round.
+    """
+
+    def __init__(self, rounds: dict[str, list[float]]) -> None:
+        super().__init__({name: statistics.median(values) for name, values in rounds.items()})
+        self.rounds = rounds
+
+    def ratio(self, over: str, under: str) -> float:
+        """Median over rounds of the ratio within a round: what slows a whole round down cancels."""
+        pairs = zip(self.rounds[over], self.rounds[under], strict=True)
+        return statistics.median(top / bottom for top, bottom in pairs)
+
+
+def alternate(contenders: Contenders, rounds: int = 20, warmup: int = 2, device: str = "cpu") -> Times:
+    """Time each contender once a round, in turn, in an order that rotates."""
     names = list(contenders)
     times: dict[str, list[float]] = {name: [] for name in names}
     for name in names:
@@ -38,7 +55,7 @@ def alternate(contenders: Contenders, rounds: int = 20, warmup: int = 2, device:
     for number in range(rounds):
         for name in names[number % len(names) :] + names[: number % len(names)]:
             times[name].append(seconds(contenders[name], device))
-    return {name: statistics.median(values) for name, values in times.items()}
+    return Times(times)
 
 
 def peak_growth(call: Callable[[], object], device: str = "cpu") -> int:

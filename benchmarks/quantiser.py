@@ -14,7 +14,7 @@ import sys
 import torch
 from torch import Tensor
 
-from benchmarks.measuring import alternate, peak_growth
+from benchmarks.measuring import Times, alternate, peak_growth
 from benchmarks.reporting import claim, machine, median, table
 from repdib_lightning.allocation import keep_freed_memory
 from repdib_lightning.bottlenecks import VectorQuantiser
@@ -23,7 +23,7 @@ SHAPES = [(128, 8, 50), (256, 8, 512), (256, 32, 512), (1024, 16, 50), (1024, 32
 BATCHES = [256, 1024, 4096]
 RULES = ["ema", "gradient"]
 LARGE_SCORES = 2**22
-"""Cells with this many scores (16 MB) or more count as large: there arithmetic dominates."""
+"""Cells with more scores than this (16 MB of them) count as large: there arithmetic dominates."""
 
 
 class Ours:
@@ -86,8 +86,8 @@ class Limit:
         return self.vectors.flatten(0, 1).index_select(0, self.known.flatten())
 
 
-def measure(shape: tuple[int, int, int], batch: int, rule: str, rounds: int, device: str) -> dict[str, float]:
-    """Median seconds of the three."""
+def measure(shape: tuple[int, int, int], batch: int, rule: str, rounds: int, device: str) -> Times:
+    """Seconds of the three."""
     torch.manual_seed(0)
     width, groups, codes = shape
     latent = torch.randn(batch, width, device=device, requires_grad=True)
@@ -189,9 +189,9 @@ def main() -> None:
         for shape in SHAPES:
             for batch in BATCHES:
                 took = measure(shape, batch, rule, options.rounds, options.device)
-                gain, overhead = took["library"] / took["ours"], took["ours"] / took["limit"]
+                gain, overhead = took.ratio("library", "ours"), took.ratio("ours", "limit")
                 gains.append(gain)
-                large = shape[1] * shape[2] * batch >= LARGE_SCORES
+                large = shape[1] * shape[2] * batch > LARGE_SCORES
                 if large:
                     overheads.append(overhead)
                 if shape == (256, 32, 512) and batch >= 1024:
@@ -199,7 +199,10 @@ def main() -> None:
                 times = [1e3 * took[name] for name in ("ours", "library", "limit")]
                 rows.append([rule, "x".join(map(str, shape)), batch, *times, gain, overhead, "large" if large else ""])
     print("## Grouped quantiser, forward and backward\n")
-    print(f"{machine(options.device)}. Median of {options.rounds} alternated calls. m x G x L; B rows.\n")
+    print(
+        f"{machine(options.device)}. Medians of {options.rounds} alternated calls, ratios of the same round. "
+        "m x G x L; B rows.\n"
+    )
     head = ["codebook", "m x G x L", "B", "ours ms", "library ms", "limit ms", "library / ours", "ours / limit", "cell"]
     print(table(head, rows) + "\n")
     print(claim("library / ours, slowest cell", min(gains), at_least=1.0))

@@ -6,6 +6,7 @@ import importlib
 import os
 import sys
 
+from repdib_lightning.allocation import keep_freed_memory
 from repdib_lightning.errors import UserError, nearest
 
 VERBS = {
@@ -49,6 +50,7 @@ def run(arguments: list[str]) -> int:
     # Threads that spin long while they wait for each other cost half the speed wherever the machine has something else
     # to do; a short spin costs nothing where it has not. GNU's OpenMP reads this when torch is first imported.
     os.environ.setdefault("GOMP_SPINCOUNT", "5000")
+    keep_freed_memory()
     module, _, function = VERBS[verb][0].partition(":")
     return int(getattr(importlib.import_module(module), function)(rest) or 0)
 

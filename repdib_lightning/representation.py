@@ -20,8 +20,6 @@ from repdib_lightning.records import Batch, BottleneckOutput, DataSpec, Objectiv
 
 DEFAULT_LOSS_WEIGHTS = {"kl": 0.01, "commitment": 0.25}
 """Paper: VIB coefficient 0.01 (all three tables); VQ-VAE: commitment 0.25. Every other term weighs 1."""
-_SHOWN = ("loss", "action_accuracy")
-"""What the progress bar shows."""
 
 
 class RepresentationModule(pl.LightningModule):
@@ -113,11 +111,15 @@ class RepresentationModule(pl.LightningModule):
         return output
 
     def training_step(self, batch: Batch, batch_index: int) -> dict[str, Any]:
-        """Return the weighted sum as ``loss`` and the raw terms as ``terms``."""
+        """Return the weighted sum as ``loss`` and the raw terms as ``terms``.
+
+        The loss and the accuracy are logged at every step, all else at those that loggers write.
+        """
         output = self._evaluate(batch)
         terms = {name: value * self._weight(name) for name, value in output.losses.items()}
         loss = torch.stack(list(terms.values())).sum()
-        self._log(_named("train", loss, output, terms))
+        values = _named("train", loss, output, terms)
+        self._log(values if self._writes_this_step() else {name: values[name] for name in values if _shown(name)})
         return {"loss": loss, "terms": {name: value.detach() for name, value in output.losses.items()}}
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
@@ -168,9 +170,19 @@ class RepresentationModule(pl.LightningModule):
         share = min(1.0, (self.global_step + 1) / steps) if steps else 1.0
         return self.loss_weights.get(name, 1.0) * share
 
+    def _writes_this_step(self) -> bool:
+        """Whether loggers write this step; in between, handing every metric to Lightning would cost time for nothing."""
+        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        return bool(every) and (self.global_step + 1) % every == 0
+
     def _log(self, values: dict[str, Tensor]) -> None:
         for name, value in values.items():
-            self.log(name, value, prog_bar=name.partition("/")[2] in _SHOWN)
+            self.log(name, value, prog_bar=_shown(name))
+
+
+def _shown(name: str) -> bool:
+    """Whether the progress bar shows it."""
+    return name.partition("/")[2] in ("loss", "action_accuracy")
 
 
 def _named(stage: str, loss: Tensor, output: ObjectiveOutput, terms: dict[str, Tensor]) -> dict[str, Tensor]:
