@@ -14,7 +14,7 @@ from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.errors import UserError
 
 _FIXED = ("seed_everything", "model", "data")
-_FREE = ("data.init_args.path", "data.init_args.workers")
+_FREE = ("data.init_args.path", "data.init_args.workers", "data.init_args.resident")
 
 
 def check_idle(folder: Path) -> None:

@@ -10,6 +10,7 @@ from torch.utils.data import DataLoader
 
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.loading import FutureFrames, ResumableLoader, as_it_is, evaluation_batches
+from repdib_lightning.data.resident import Mapped, Resident, Source
 from repdib_lightning.data.sampling import FutureSampling
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.records import ArraySpec, Batch, DataSpec, Split
@@ -27,6 +28,9 @@ class EpisodeDataModule(pl.LightningDataModule):
         views: observations to use; all by default.
         workers: loader processes; 0 reads in the training process, which is best while the file fits in memory.
         seed: of the order of samples.
+        resident: keep the arrays that are used on the training device, as they are stored (a picture stays uint8), and
+            gather the same batches there: fastest where the data fit its memory. They are loaded once, by the first
+            batch; each process of a training keeps its own copy. Needs workers = 0. Off: read through memory maps.
     """
 
     def __init__(
@@ -39,19 +43,27 @@ class EpisodeDataModule(pl.LightningDataModule):
         views: list[str] | None = None,
         workers: int = 0,
         seed: int = 0,
+        resident: bool = False,
     ) -> None:
         super().__init__()
         self.path = Path(path)
         self.batch_size, self.horizon, self.futures = batch_size, horizon, futures
         self.frame_stack, self.views, self.workers, self.seed = frame_stack, views, workers, seed
+        self.resident = resident
         for name in ("batch_size", "horizon", "futures", "frame_stack"):
             if getattr(self, name) < 1:
                 raise UserError(f"data.{name} must be at least 1, is {getattr(self, name)}")
         if workers < 0 or seed < 0:
             raise UserError(f"data.workers and data.seed must not be negative, are {workers} and {seed}")
+        if resident and workers:
+            raise UserError(
+                f"data.resident keeps the data in the training process, data.workers is {workers}: other processes "
+                "cannot read there; set data.workers to 0"
+            )
         if views is not None and not views:
             raise UserError("data.views is empty; name at least one observation, or leave the option out to use all")
         self.store: EpisodeStore | None = None
+        self._kept: Resident | None = None
 
     def setup(self, stage: str | None = None) -> None:
         """Open and validate the store. Raises UserError, naming file and key, where something is wrong."""
@@ -73,9 +85,8 @@ class EpisodeDataModule(pl.LightningDataModule):
     def spec(self) -> DataSpec:
         """What a model must know of the data. Only after :meth:`setup`."""
         assert self.store is not None, "setup() opens the store first"
-        views = self.views or list(self.store.observations)
         observations = {}
-        for name in views:
+        for name in self._used_views():
             array = self.store.observations[name]
             shape = (array.shape[0] * self.frame_stack, *array.shape[1:])
             observations[name] = ArraySpec(shape, array.dtype)
@@ -83,23 +94,24 @@ class EpisodeDataModule(pl.LightningDataModule):
 
     def example(self) -> Batch:
         """The first two held-out samples. Only after :meth:`setup`."""
-        return self._frames(self._evaluation).__getitems__([0, 1])
+        assert self.store is not None
+        return self._frames(self._evaluation, Mapped(self.store)).__getitems__([0, 1])
 
     def train_dataloader(self) -> ResumableLoader:
         """Shuffled anchors of the training episodes, resumable at any batch."""
         rank, world_size = self._place()
         return ResumableLoader(
-            self._frames(self._training),
+            self._frames(self._training, self._source()),
             self.batch_size,
             workers=self.workers,
             rank=rank,
             world_size=world_size,
-            pin_memory=torch.cuda.is_available(),
+            pin_memory=torch.cuda.is_available() and not self.resident,
         )
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """Anchors of the evaluation episodes, each once, in the same order each time."""
-        dataset = self._frames(self._evaluation)
+        dataset = self._frames(self._evaluation, self._source())
         batches = evaluation_batches(len(dataset), self.batch_size, *self._place())
         return DataLoader(dataset, batch_sampler=batches, collate_fn=as_it_is, num_workers=self.workers)
 
@@ -110,6 +122,23 @@ class EpisodeDataModule(pl.LightningDataModule):
     def _place(self) -> tuple[int, int]:
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
-    def _frames(self, sampling: FutureSampling) -> FutureFrames:
+    def _used_views(self) -> list[str]:
         assert self.store is not None
-        return FutureFrames(self.store, sampling, self.frame_stack, self.views or list(self.store.observations))
+        return self.views or list(self.store.observations)
+
+    def _source(self) -> Source:
+        """The file, or what is kept of it on the device of the trainer (the CPU if there is none)."""
+        assert self.store is not None
+        if not self.resident:
+            return Mapped(self.store)
+        device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+        if self._kept is None or self._kept.device != device:
+            names = [f"observations/{view}" for view in self._used_views()]
+            if self.store.actions_spec is not None:
+                names.append("actions")
+            self._kept = Resident(self.store, names, device)
+        return self._kept
+
+    def _frames(self, sampling: FutureSampling, source: Source) -> FutureFrames:
+        assert self.store is not None
+        return FutureFrames(self.store, sampling, self.frame_stack, self._used_views(), source)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -141,6 +142,19 @@ class EpisodeStore:
             return np.dtype(np.int64 if self.actions_spec.kind == "discrete" else np.float32)
         factor = self.factors.get(name.removeprefix("factors/")) if name.startswith("factors/") else None
         return np.dtype(np.int64) if factor and factor.scale == "categorical" else stored.newbyteorder("=")
+
+    def layout(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+        """Shape of a key's array, and its type in memory."""
+        _, shape, dtype = self._places[name]
+        return shape, self._dtype_in_memory(name, dtype)
+
+    def parts(self, name: str, size: int) -> Iterator[np.ndarray]:
+        """The whole array of a key in consecutive parts of at most ``size`` bytes (or one row), which are not kept."""
+        shape, dtype = self.layout(name)
+        step = max(1, size // (int(np.prod(shape[1:])) * dtype.itemsize))
+        with h5py.File(self.path, "r") as file:
+            for first in range(0, shape[0], step):
+                yield file[name][first : first + step].astype(dtype, copy=False)
 
     def gather(self, name: str, rows: np.ndarray) -> np.ndarray:
         """Copy the given rows of one key, in any order and with repeats: (n,) int64 -> (n, ...)."""

@@ -10,7 +10,8 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from repdib_lightning.data.episodes import EpisodeStore
-from repdib_lightning.data.sampling import FutureSampling, gather_stacks
+from repdib_lightning.data.resident import Mapped, Source
+from repdib_lightning.data.sampling import FutureSampling, stacked_rows
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import Batch
 
@@ -23,11 +24,20 @@ class FutureFrames(Dataset[Batch]):
         sampling: which rows make a sample.
         frame_stack: S.
         views: observations to read.
+        source: where their rows and those of the actions are gathered from; the memory-mapped file by default.
     """
 
-    def __init__(self, store: EpisodeStore, sampling: FutureSampling, frame_stack: int, views: list[str]) -> None:
+    def __init__(
+        self,
+        store: EpisodeStore,
+        sampling: FutureSampling,
+        frame_stack: int,
+        views: list[str],
+        source: Source | None = None,
+    ) -> None:
         self.store, self.sampling = store, sampling
         self.frame_stack, self.views = frame_stack, views
+        self.source = source or Mapped(store)
 
     def __len__(self) -> int:
         return len(self.sampling)
@@ -38,14 +48,13 @@ class FutureFrames(Dataset[Batch]):
     def __getitems__(self, numbers: list[int]) -> Batch:
         """Gather the samples with these numbers in the stream as one :class:`Batch`."""
         anchors, offsets = self.sampling.draw(np.asarray(numbers, np.int64))
-        rows = (anchors[:, None] + offsets).reshape(-1)
+        newest = (anchors[:, None] + offsets).reshape(-1)
+        rows = stacked_rows(self.store, newest, self.frame_stack).reshape(-1)
         observations = {}
         for name in self.views:
-            frames = gather_stacks(self.store, name, rows, self.frame_stack)
-            observations[name] = torch.from_numpy(frames.reshape(*offsets.shape, *frames.shape[1:]))
-        actions = None
-        if self.store.actions_spec is not None:
-            actions = torch.from_numpy(self.store.gather("actions", anchors))
+            frames = self.source.gather(f"observations/{name}", rows)
+            observations[name] = frames.reshape(*offsets.shape, -1, *frames.shape[2:])
+        actions = self.source.gather("actions", anchors) if self.store.actions_spec is not None else None
         return Batch(observations, actions, torch.from_numpy(offsets), torch.from_numpy(anchors))
 
 

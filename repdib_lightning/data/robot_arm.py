@@ -12,7 +12,7 @@ class RobotArmDataModule(EpisodeDataModule):
         path: the store.
         samples: actions to record where the file has to be collected (paper: 14,000).
         collection_seed: of that recording.
-        batch_size, horizon, futures, frame_stack, views, workers, seed: see :class:`EpisodeDataModule`.
+        batch_size, horizon, futures, frame_stack, views, workers, seed, resident: see :class:`EpisodeDataModule`.
     """
 
     def __init__(
@@ -27,8 +27,9 @@ class RobotArmDataModule(EpisodeDataModule):
         views: list[str] | None = None,
         workers: int = 0,
         seed: int = 0,
+        resident: bool = False,
     ) -> None:
-        super().__init__(path, batch_size, horizon, futures, frame_stack, views, workers, seed)
+        super().__init__(path, batch_size, horizon, futures, frame_stack, views, workers, seed, resident)
         self.samples, self.collection_seed = samples, collection_seed
 
     def prepare_data(self) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 import torch
@@ -110,6 +113,18 @@ def test_the_global_generator_is_left_alone(store):
     before = torch.get_rng_state()
     list(loader(store, workers=2))
     assert torch.equal(before, torch.get_rng_state())
+
+
+def test_a_dropped_loader_frees_its_workers_without_the_garbage_collector(store):
+    dropped = loader(store, workers=2)
+    next(iter(dropped))
+    stream = weakref.ref(dropped._stream)
+    gc.disable()
+    try:
+        del dropped
+        assert stream() is None
+    finally:
+        gc.enable()
 
 
 def test_ranks_together_see_what_one_process_sees(store):
