@@ -106,9 +106,14 @@ class ResumableLoader:
         if self._stream is None:
             self._stream = iter(self._open())
         while self.batch < len(self):
-            batch = next(self._stream)
-            self.batch += 1
-            yield batch
+            yield self._next()
+
+    def _next(self) -> Batch:
+        """One batch, to which no name here refers while the next one is made: that would be memory for one more."""
+        assert self._stream is not None
+        batch = next(self._stream)
+        self.batch += 1
+        return batch
 
     def _open(self) -> DataLoader[Batch]:
         return DataLoader(
