@@ -7,7 +7,7 @@ DEMO := runs/demo
 SEED ?= 0
 FULL := runs/robot_arm/seed_$(SEED)
 
-.PHONY: install demo robot-arm test lint clean
+.PHONY: install demo robot-arm bench bench-gpu test lint clean
 
 install: .venv/installed
 
@@ -38,6 +38,11 @@ robot-arm: install
 			--run $(FULL)/$$kind && $(RUN) export $(FULL)/$$kind || exit 1; \
 	done
 	$(RUN) compare data/robot_arm.h5 $(FULL)/report.html $(FULL)/none $(FULL)/repdib
+
+# Speed against peers and limits, about 25 minutes; writes results/benchmarks.md. Close other programs first.
+bench bench-gpu: install
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
+	$(BIN)/python -m benchmarks $(if $(filter bench-gpu,$@),--device cuda)
 
 test: install lint
 	$(BIN)/python -m pytest

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import argparse
 import copy
-import ctypes
+import os
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +76,27 @@ class BareStep:
         self.optimizer.step()
 
 
+class CapturedStep:
+    """A bare step recorded as a CUDA graph: nothing is left but the kernels. The limit on a GPU."""
+
+    def __init__(self, step: BareStep) -> None:
+        parameters = [p for part in step.parts for p in part.parameters()]
+        step.optimizer = torch.optim.Adam(parameters, lr=3e-4, fused=True, capturable=True)
+        aside = torch.cuda.Stream()
+        aside.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(aside):
+            for _ in range(3):
+                step()
+        torch.cuda.current_stream().wait_stream(aside)
+        self.graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self.graph):
+            step()
+
+    def __call__(self) -> None:
+        """One step."""
+        self.graph.replay()
+
+
 class Alternate(Callback):
     """Stops ``fit`` every few steps for as many bare steps; what ``fit`` took is all the time in between.
 
@@ -117,7 +140,8 @@ def run_fit(options: list[str], alternation: Alternate, windows: int, folder: Pa
     arguments += ["--model.bottleneck.init_args.start_step", str(max(1, alternation.warmup // 2))]
     arguments += ["--trainer.callbacks", "benchmarks.training_step.Lent"]
     Lent.alternation = alternation
-    code = command_line.run(arguments)
+    with redirect_stdout(sys.stderr):
+        code = command_line.run(arguments)
     assert code == 0, f"fit ended with {code}"
 
 
@@ -142,8 +166,6 @@ def variants(step: BareStep, rounds: int, device: str, compiled: bool) -> Times:
         "bf16 (autocast)": [bf16],
         "pictures as (N, C, H, W)": [contiguous_pictures],
     }
-    if device == "cpu":
-        settings["freed memory given back"] = [given_back_memory]
     if compiled:
         quick = torch.compile(step.encoder)
         settings["encoder compiled"] = [lambda: encoding_with(step, quick)]
@@ -183,17 +205,23 @@ def contiguous_pictures() -> Iterator[None]:
         convolutional.centred = views.centred
 
 
-@contextmanager
-def given_back_memory() -> Iterator[None]:
-    """The C library's own thresholds: 128 KiB to trim, mappings for large blocks."""
-    mallopt = ctypes.CDLL(None).mallopt
-    mallopt(-1, 128 << 10)
-    mallopt(-3, 128 << 10)
-    mallopt(-4, 65536)
-    try:
-        yield
-    finally:
-        keep_freed_memory()
+def step_in_a_new_process(setting: str, keep: bool, threads: int) -> float:
+    """Median seconds of a bare step where the allocator was told, or not told, to keep what is freed."""
+    environment = os.environ if keep else {**os.environ, "MALLOC_TRIM_THRESHOLD_": str(128 << 10)}
+    command = [sys.executable, "-m", "benchmarks.training_step", "--only", setting, "--threads", str(threads)]
+    done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+    return float(done.stdout.split()[-1])
+
+
+def bare_step(setting: str, device: str) -> BareStep:
+    """The step as ``fit`` has it after its first steps."""
+    arguments, pictures, actions = SETTINGS[setting]
+    alternation = Alternate(1, warmup=4)
+    with tempfile.TemporaryDirectory() as folder:
+        store = stores.write(Path(folder) / "store.h5", pictures, actions, rows=4000)
+        run_fit([*arguments, "--data.path", str(store)], alternation, 1, Path(folder), device)
+    assert alternation.step is not None
+    return alternation.step
 
 
 def main() -> None:
@@ -205,10 +233,14 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=5, help="of a window")
     parser.add_argument("--rounds", type=int, default=20, help="of the variants; 0 leaves them out")
     parser.add_argument("--no_compile", action="store_true", help="leave torch.compile out (it needs a C++ compiler)")
+    parser.add_argument("--only", choices=list(SETTINGS), help="print the seconds of a bare step and nothing else")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     keep_freed_memory()
-    rows, shares, gains = [], {}, []
+    if options.only:
+        print(alternate({"step": bare_step(options.only, options.device)}, options.rounds)["step"])
+        return
+    rows, shares, gains, captured = [], {}, [], {}
     for name, (arguments, pictures, actions) in SETTINGS.items():
         alternation = Alternate(options.steps, warmup=4)
         with tempfile.TemporaryDirectory() as folder:
@@ -219,10 +251,18 @@ def main() -> None:
             total = sum(alternation.bare) / sum(alternation.fit)
             rows.append([name, 1 / times["fit"], 1 / times["bare"], times.ratio("bare", "fit"), total])
             shares[name] = total
+            if options.device != "cpu":
+                assert alternation.step is not None
+                graph = CapturedStep(copy.deepcopy(alternation.step))
+                took = alternate({"bare": alternation.step, "graph": graph}, 20, device=options.device)
+                captured[name] = total * took.ratio("graph", "bare")
             if options.rounds:
                 assert alternation.step is not None
                 took = variants(alternation.step, options.rounds, options.device, not options.no_compile)
                 gains += [[name, kind, 1e3 * took[kind], took.ratio("as shipped", kind)] for kind in took]
+                if options.device == "cpu":
+                    kept, given = (step_in_a_new_process(name, keep, options.threads) for keep in (True, False))
+                    gains.append([name, "freed memory given back (new processes)", 1e3 * given, kept / given])
     print("## Training step\n")
     print(
         f"{machine(options.device)}. {options.windows} windows of {options.steps} steps each, fit and bare loop in "
@@ -232,6 +272,8 @@ def main() -> None:
     print()
     for name, share in shares.items():
         print(claim(f"{name}: steps/s of fit / bare loop, in all", share, at_least=0.95))
+    for name, share in captured.items():
+        print(claim(f"{name}: steps/s of fit / bare step captured as a CUDA graph", share, at_least=0.9))
     if gains:
         print(
             "\nOne bare step with one thing changed (shipped: float32, pictures in memory as (N, H, W, C), freed "

@@ -172,7 +172,9 @@ class RepresentationModule(pl.LightningModule):
 
     def _writes_this_step(self) -> bool:
         """Whether loggers write this step; in between, handing every metric to Lightning would cost time for nothing."""
-        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if self._trainer is None:
+            return True
+        every: int = self._trainer.log_every_n_steps  # type: ignore[attr-defined]
         return bool(every) and (self.global_step + 1) % every == 0
 
     def _log(self, values: dict[str, Tensor]) -> None:
