@@ -16,7 +16,7 @@ from pathlib import Path
 from benchmarks.reporting import machine
 from repdib_lightning.data.files import whole_file
 
-CPU = ["quantiser", "data_path", "training_step", "encoding", "start"]
+CPU = ["quantiser", "quantiser --keep_memory", "data_path", "training_step", "encoding", "start"]
 CUDA = ["quantiser", "data_path", "training_step", "encoding", "offline_run"]
 ROOT = Path(__file__).parent.parent
 
@@ -31,7 +31,7 @@ def main() -> None:
     environment = {"GOMP_SPINCOUNT": "5000", **os.environ}
     parts = []
     for name in CUDA if gpu else CPU:
-        command = [sys.executable, "-m", f"benchmarks.{name}"]
+        command = [sys.executable, "-m", *f"benchmarks.{name}".split()]
         command += ["--device", device] if gpu else []
         print(f"--- {' '.join(command[1:])}", flush=True)
         done = subprocess.run(command, cwd=ROOT, env=environment, check=True, stdout=subprocess.PIPE, text=True)

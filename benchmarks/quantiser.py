@@ -198,7 +198,8 @@ def main() -> None:
                     at_32.append(gain)
                 times = [1e3 * took[name] for name in ("ours", "library", "limit")]
                 rows.append([rule, "x".join(map(str, shape)), batch, *times, gain, overhead, "large" if large else ""])
-    print("## Grouped quantiser, forward and backward\n")
+    allocator = ", freed memory kept (as the command line does)" if options.keep_memory else ""
+    print(f"## Grouped quantiser, forward and backward{allocator}\n")
     print(
         f"{machine(options.device)}. Medians of {options.rounds} alternated calls, ratios of the same round. "
         "m x G x L; B rows.\n"

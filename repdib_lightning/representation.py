@@ -171,7 +171,7 @@ class RepresentationModule(pl.LightningModule):
         return self.loss_weights.get(name, 1.0) * share
 
     def _writes_this_step(self) -> bool:
-        """Whether loggers write this step; in between, handing every metric to Lightning would cost time for nothing."""
+        """Whether loggers write this step; in between, metrics that nobody reads would cost time."""
         if self._trainer is None:
             return True
         every: int = self._trainer.log_every_n_steps  # type: ignore[attr-defined]
