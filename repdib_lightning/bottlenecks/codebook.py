@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from repdib_lightning.bottlenecks.chunks import row_chunks
 from repdib_lightning.bottlenecks.nearest import nearest_codes
 from repdib_lightning.bottlenecks.precision import SinglePrecision
 from repdib_lightning.errors import UserError
@@ -103,7 +104,8 @@ class Codebook(SinglePrecision):
         books, codes, size = self.vectors.shape
         tally = rows.new_zeros(books * codes * (size + 1))  # in one piece, so that one exchange carries both
         sums, total = tally[: books * codes * size].view(-1, size), tally[books * codes * size :].view(books, codes)
-        sums.index_add_(0, chosen, rows.reshape(-1, size))
+        for part in row_chunks(rows):
+            sums.index_add_(0, chosen[part.start * books : part.stop * books], rows[part].reshape(-1, size))
         total.copy_(counts)
         sum_over_processes(tally)
         self.sizes.lerp_(total, 1 - self.decay)

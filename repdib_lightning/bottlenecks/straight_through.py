@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-_CHUNK_ELEMENTS = 2**18
-"""Elements that one thread treats at once on a CPU: few enough to stay in its cache from one operation to the next."""
+from repdib_lightning.bottlenecks.chunks import row_chunks
 
 
 def replace_by_codes(latent: Tensor, vectors: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -36,7 +35,7 @@ class _ReplaceByCodes(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, latent: Tensor, vectors: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         codes = vectors.flatten(0, 1).index_select(0, chosen).view_as(latent)
-        squares = [torch.linalg.vector_norm(codes[rows] - latent[rows]).square() for rows in _chunks(latent)]
+        squares = [torch.linalg.vector_norm(codes[rows] - latent[rows]).square() for rows in row_chunks(latent)]
         error = torch.stack(squares).sum() / latent.numel()
         ctx.save_for_backward(latent, codes, chosen)
         ctx.books = vectors.shape
@@ -51,7 +50,7 @@ class _ReplaceByCodes(torch.autograd.Function):
         to_latent = torch.empty_like(latent) if for_latent else None
         sums = latent.new_zeros(books * per_book, size) if for_vectors else None
         scale = 2.0 / latent.numel()
-        for rows in _chunks(latent):
+        for rows in row_chunks(latent):
             difference = codes[rows] - latent[rows]
             if to_latent is not None:
                 torch.addcmul(to_codes[rows], difference, to_commitment * -scale, out=to_latent[rows])
@@ -60,12 +59,3 @@ class _ReplaceByCodes(torch.autograd.Function):
                 sums.index_add_(0, chosen[segments], difference.view(-1, size))
         to_vectors = sums.mul_(to_codebook * scale).view(ctx.books) if sums is not None else None
         return to_latent, to_vectors, None
-
-
-def _chunks(latent: Tensor) -> list[slice]:
-    """Rows to treat at once. One chunk on a GPU and under a compiler, which has no loop to unroll then."""
-    rows, width = latent.shape
-    if latent.device.type != "cpu" or torch.compiler.is_compiling():
-        return [slice(0, rows)]
-    step = max(1, _CHUNK_ELEMENTS * torch.get_num_threads() // width)
-    return [slice(start, min(start + step, rows)) for start in range(0, rows, step)]

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from repdib_lightning.bottlenecks import straight_through
+from repdib_lightning.bottlenecks import chunks
 from repdib_lightning.bottlenecks.straight_through import replace_by_codes
 
 N, M, D, L = 29, 12, 4, 6
@@ -20,7 +20,7 @@ def slow(latent, vectors, chosen):
 @pytest.mark.parametrize("chunk", [1, 50, 10**6])
 @pytest.mark.parametrize("weights", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0.25, 2)])
 def test_outputs_and_gradients(books, chunk, weights, monkeypatch):
-    monkeypatch.setattr(straight_through, "_CHUNK_ELEMENTS", chunk)
+    monkeypatch.setattr(chunks, "_CHUNK_ELEMENTS", chunk)
     torch.manual_seed(0)
     latent = torch.randn(N, M, dtype=torch.float64, requires_grad=True)
     vectors = torch.randn(books, L, D, dtype=torch.float64, requires_grad=True)

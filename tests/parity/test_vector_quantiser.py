@@ -69,8 +69,10 @@ def test_gradients(shared):
     torch.testing.assert_close(moved, expected)
 
 
+@pytest.mark.parametrize("chunk", [30, 10**6])
 @pytest.mark.parametrize("shared", [False, True])
-def test_running_averages_over_three_steps(shared):
+def test_running_averages_over_three_steps(shared, chunk, monkeypatch):
+    monkeypatch.setattr("repdib_lightning.bottlenecks.chunks._CHUNK_ELEMENTS", chunk)
     decay, smoothing = 0.8, 1e-5
     quantiser = build(shared=shared, decay=decay, revive_after=0)
     vectors = quantiser.codebook.clone()
