@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_CACHE_BYTES = {"cpu": 2 << 20, "cuda": 256 << 20}
-"""Scores to hold at once, per thread on a CPU. More is slower there: memory that was never touched must first be
-mapped by the system. On a GPU this only bounds the memory."""
+_CACHE_BYTES = {"cpu": 4 << 20, "cuda": 256 << 20}
+"""Scores to hold at once, for each of at most eight threads on a CPU. With more, they leave the cache; with less, threads
+wait for each other longer than they work. On a GPU this only bounds the memory."""
 _BLOCKS = 16
 _MANY_CODES = 256
 
@@ -45,7 +45,7 @@ def nearest_codes(rows: Tensor, codes: Tensor) -> Tensor:
 
 def _chunk(rows: Tensor, codes: int) -> tuple[int, int]:
     """How many books, and how many rows of each, have scores that fit the cache."""
-    threads = torch.get_num_threads() if rows.device.type == "cpu" else 1
+    threads = min(8, torch.get_num_threads()) if rows.device.type == "cpu" else 1
     scores = _CACHE_BYTES.get(rows.device.type, _CACHE_BYTES["cuda"]) * threads // rows.element_size()
     at_once = max(1, scores // codes)
     count = max(1, rows.shape[1])
