@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 _CACHE_BYTES = {"cpu": 4 << 20, "cuda": 256 << 20}
-"""Scores to hold at once, for each of at most eight threads on a CPU. With more, they leave the cache; with less, threads
-wait for each other longer than they work. On a GPU this only bounds the memory."""
+"""Scores to hold at once, for each of at most eight threads on a CPU: more would leave the cache, and with fewer the
+threads wait for each other longer than they work. On a GPU this only bounds the memory."""
 _BLOCKS = 16
 _MANY_CODES = 256
 
