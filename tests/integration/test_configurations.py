@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parent))
+from killing import command_in_processes
+
 from repdib_lightning.__main__ import VERBS, main
 from repdib_lightning.configurations import packaged
 from repdib_lightning.environments.collect import collect_robot_arm
@@ -92,7 +95,10 @@ def test_every_command_of_the_readme(here, monkeypatch):
             small = SMALL if "--resume" not in command else ["--trainer.max_steps", "4"]
             if "bottleneck/none" not in command and "--resume" not in command:
                 small = [*small, *QUANTISER_AT_ONCE]
-        assert main([*command, *small]) == 0, command
+        if "--trainer.devices" in command:
+            assert command_in_processes(2, here, *command, *small) == [0, 0], (here / "output.txt").read_text()
+        else:
+            assert main([*command, *small]) == 0, command
 
 
 def test_the_python_of_the_readme(here):
