@@ -39,7 +39,7 @@ robot-arm: install
 	done
 	$(RUN) compare data/robot_arm.h5 $(FULL)/report.html $(FULL)/none $(FULL)/repdib
 
-# Speed against peers and limits, about 25 minutes; writes results/benchmarks.md. Close other programs first.
+# Speed against peers and limits, about 20 minutes; writes results/benchmarks.md. Close other programs first.
 bench bench-gpu: install
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
 	$(BIN)/python -m benchmarks $(if $(filter bench-gpu,$@),--device cuda)

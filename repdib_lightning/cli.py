@@ -50,7 +50,7 @@ SLOTS: dict[str, list[str]] = {
 
 _DESCRIPTION = """Train a representation. Without --config this is the default run: the simulated robot arm
 (3x3 cells, two cameras, 14,000 samples, collected on first use) with multi-step inverse dynamics and the RepDIB
-bottleneck (VIB, then 8 groups x 50 codes), 1,000 steps; about six minutes on two cores. Overlays change it:
+bottleneck (VIB, then 8 groups x 50 codes), 1,000 steps; about four minutes on two cores. Overlays change it:
 --config robot_arm --config bottleneck/none. Packaged configurations: {names}."""
 
 _HARMLESS = (
