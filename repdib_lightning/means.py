@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torchmetrics import MeanMetric
+from torchmetrics import SumMetric
 
 
 class SampleMeans:
@@ -15,18 +15,21 @@ class SampleMeans:
     """
 
     def __init__(self) -> None:
-        self._means: dict[str, MeanMetric] = {}
+        self._sums: dict[str, SumMetric] = {}
+        self._samples: dict[str, SumMetric] = {}
 
     @torch.no_grad()
     def add(self, values: dict[str, Tensor], samples: int) -> None:
         """Add the scalar means of one batch of so many samples."""
         for name, value in values.items():
-            if name not in self._means:
-                self._means[name] = MeanMetric().to(value.device)
-            self._means[name].update(value, samples)
+            if name not in self._sums:
+                self._sums[name] = SumMetric(nan_strategy="disable").to(value.device)
+                self._samples[name] = SumMetric().to(value.device)
+            self._sums[name].update(value * samples)
+            self._samples[name].update(samples)
 
     def take(self) -> dict[str, Tensor]:
         """Return the means over what all processes added, and start anew. Every process must call this."""
-        means = {name: metric.compute() for name, metric in self._means.items()}
-        self._means = {}
+        means = {name: total.compute() / self._samples[name].compute() for name, total in self._sums.items()}
+        self._sums, self._samples = {}, {}
         return means

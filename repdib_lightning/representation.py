@@ -132,11 +132,11 @@ class RepresentationModule(pl.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Log their means over all samples of all processes."""
-        self._log(self._held_out.take())
+        self._log(self._held_out.take(), sync_dist=True)
 
     def on_test_epoch_end(self) -> None:
         """Log their means over all samples of all processes."""
-        self._log(self._held_out.take())
+        self._log(self._held_out.take(), sync_dist=True)
 
     def _add_held_out(self, stage: str, batch: Batch) -> None:
         output = self._evaluate(batch)
@@ -177,9 +177,9 @@ class RepresentationModule(pl.LightningModule):
         every: int = self._trainer.log_every_n_steps  # type: ignore[attr-defined]
         return bool(every) and (self.global_step + 1) % every == 0
 
-    def _log(self, values: dict[str, Tensor]) -> None:
+    def _log(self, values: dict[str, Tensor], sync_dist: bool = False) -> None:
         for name, value in values.items():
-            self.log(name, value, prog_bar=_shown(name))
+            self.log(name, value, prog_bar=_shown(name), sync_dist=sync_dist)
 
 
 def _shown(name: str) -> bool:

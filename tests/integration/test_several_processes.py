@@ -136,14 +136,20 @@ def test_another_number_of_processes_is_refused(two):
     assert "written by 2 processes, this run has 1" in (two / "output.txt").read_text()
 
 
-def test_started_by_lightning(two, tmp_path, make_store):
-    """The command of the README: the first process starts the second."""
+LIGHTNING = [sys.executable, "-m", "repdib_lightning"]
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2", "-m", "--"]
+
+
+@pytest.mark.parametrize("launch", [LIGHTNING, [*TORCHRUN, "repdib_lightning"]], ids=["lightning", "torchrun"])
+def test_the_commands_of_the_readme(two, tmp_path, make_store, launch):
+    """Lightning's first process starts the second; torchrun starts both."""
     folder = made(tmp_path / "started", make_store)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
-    call = [sys.executable, "-m", "repdib_lightning", *arguments(*TWO)]
-    done = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, timeout=240)
+    done = subprocess.run(
+        [*launch, *arguments(*TWO)], cwd=folder, env=environment, capture_output=True, text=True, timeout=240
+    )
     assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
+    assert "Traceback" not in done.stderr and "sync_dist" not in done.stderr
     final = torch.load(last_good(folder / "run"), weights_only=True)["state_dict"]
     for key, value in seen(two, 2)[0]["state"].items():
         assert torch.equal(final[key], value), key
