@@ -213,15 +213,14 @@ def step_in_a_new_process(setting: str, keep: bool, threads: int) -> float:
     return float(done.stdout.split()[-1])
 
 
-def bare_step(setting: str, device: str) -> BareStep:
-    """The step as ``fit`` has it after its first steps."""
+def alternated(setting: str, steps: int, windows: int, device: str) -> Alternate:
+    """Run ``fit`` in a setting, on data of noise, with windows of bare steps in it."""
     arguments, pictures, actions = SETTINGS[setting]
-    alternation = Alternate(1, warmup=4)
+    alternation = Alternate(steps, warmup=4)
     with tempfile.TemporaryDirectory() as folder:
         store = stores.write(Path(folder) / "store.h5", pictures, actions, rows=4000)
-        run_fit([*arguments, "--data.path", str(store)], alternation, 1, Path(folder), device)
-    assert alternation.step is not None
-    return alternation.step
+        run_fit([*arguments, "--data.path", str(store)], alternation, windows, Path(folder), device)
+    return alternation
 
 
 def main() -> None:
@@ -238,31 +237,28 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     keep_freed_memory()
     if options.only:
-        print(alternate({"step": bare_step(options.only, options.device)}, options.rounds)["step"])
+        step = alternated(options.only, 1, 1, options.device).step
+        assert step is not None
+        print(alternate({"step": step}, options.rounds)["step"])
         return
     rows, shares, gains, captured = [], {}, [], {}
-    for name, (arguments, pictures, actions) in SETTINGS.items():
-        alternation = Alternate(options.steps, warmup=4)
-        with tempfile.TemporaryDirectory() as folder:
-            store = stores.write(Path(folder) / "store.h5", pictures, actions, rows=4000)
-            more = [*arguments, "--data.path", str(store)]
-            run_fit(more, alternation, options.windows, Path(folder), options.device)
-            times = Times({"fit": alternation.fit, "bare": alternation.bare})
-            total = sum(alternation.bare) / sum(alternation.fit)
-            rows.append([name, 1 / times["fit"], 1 / times["bare"], times.ratio("bare", "fit"), total])
-            shares[name] = total
-            if options.device != "cpu":
-                assert alternation.step is not None
-                graph = CapturedStep(copy.deepcopy(alternation.step))
-                took = alternate({"bare": alternation.step, "graph": graph}, 20, device=options.device)
-                captured[name] = total * took.ratio("graph", "bare")
-            if options.rounds:
-                assert alternation.step is not None
-                took = variants(alternation.step, options.rounds, options.device, not options.no_compile)
-                gains += [[name, kind, 1e3 * took[kind], took.ratio("as shipped", kind)] for kind in took]
-                if options.device == "cpu":
-                    kept, given = (step_in_a_new_process(name, keep, options.threads) for keep in (True, False))
-                    gains.append([name, "freed memory given back (new processes)", 1e3 * given, kept / given])
+    for name in SETTINGS:
+        alternation = alternated(name, options.steps, options.windows, options.device)
+        step = alternation.step
+        assert step is not None
+        times = Times({"fit": alternation.fit, "bare": alternation.bare})
+        shares[name] = sum(alternation.bare) / sum(alternation.fit)
+        rows.append([name, 1 / times["fit"], 1 / times["bare"], times.ratio("bare", "fit"), shares[name]])
+        if options.device != "cpu":
+            graph = CapturedStep(copy.deepcopy(step))
+            took = alternate({"bare": step, "graph": graph}, options.rounds or 20, device=options.device)
+            captured[name] = shares[name] * took.ratio("graph", "bare")
+        if options.rounds:
+            took = variants(step, options.rounds, options.device, not options.no_compile)
+            gains += [[name, kind, 1e3 * took[kind], took.ratio("as shipped", kind)] for kind in took]
+            if options.device == "cpu":
+                kept, given = (step_in_a_new_process(name, keep, options.threads) for keep in (True, False))
+                gains.append([name, "freed memory given back (new processes)", 1e3 * given, kept / given])
     print("## Training step\n")
     print(
         f"{machine(options.device)}. {options.windows} windows of {options.steps} steps each, fit and bare loop in "

@@ -47,8 +47,8 @@ def run(arguments: list[str]) -> int:
     verb, rest = arguments[0], arguments[1:]
     if verb not in VERBS:
         raise UserError(f"unknown verb '{verb}': {nearest(verb, VERBS)}")
-    # Threads that spin long while they wait for each other cost half the speed wherever the machine has something else
-    # to do; a short spin costs nothing where it has not. GNU's OpenMP reads this when torch is first imported.
+    # Threads that spin long while they wait for each other slow each other down wherever the machine has something else
+    # to do. GNU's OpenMP reads this when torch is first imported.
     os.environ.setdefault("GOMP_SPINCOUNT", "5000")
     keep_freed_memory()
     module, _, function = VERBS[verb][0].partition(":")

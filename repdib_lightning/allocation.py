@@ -15,8 +15,8 @@ def keep_freed_memory() -> bool:
     """Tell the C library of this process not to give freed memory back to the system; returns whether it did.
 
     By default glibc returns large blocks at once and asks for them again in the next step, where the system must map
-    and clear every page anew: for the activations of a convolution stack on a CPU that takes longer than the
-    arithmetic (``benchmarks/training_step.py``). The price: the process stays as large as it ever was.
+    and clear every page anew: for the activations of a convolution stack on a CPU that can take nearly as long
+    as the arithmetic (``benchmarks/training_step.py``). The price: the process stays as large as it ever was.
 
     The command line calls this; a script of your own may, before it trains. Nothing happens without glibc, or where
     the environment chooses already (``MALLOC_TRIM_THRESHOLD_``, ``MALLOC_MMAP_MAX_``, ``MALLOC_MMAP_THRESHOLD_``, or
