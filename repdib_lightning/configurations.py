@@ -10,11 +10,19 @@ from repdib_lightning.errors import UserError, nearest
 
 
 def packaged() -> dict[str, Path]:
-    """Name (without .yaml, with its folder) -> file of every configuration that ships with the package."""
+    """Name (without .yaml, with its folder) -> file of every configuration of a run that ships with the package."""
+    names = {str(path.relative_to(_root()).with_suffix("")): path for path in sorted(_root().rglob("*.yaml"))}
+    return {name: path for name, path in names.items() if not name.startswith("suites/")}
+
+
+def packaged_suites() -> dict[str, Path]:
+    """Name (without .yaml) -> file of every suite that ships with the package."""
+    return {path.stem: path for path in sorted(_root().glob("suites/*.yaml"))}
+
+
+def _root() -> Path:
     installed, cloned = Path(__file__).parent / "conf", Path(__file__).parents[1] / "conf"
-    root = installed if installed.is_dir() else cloned
-    found = sorted(root.rglob("*.yaml"))
-    return {str(path.relative_to(root).with_suffix("")): path for path in found}
+    return installed if installed.is_dir() else cloned
 
 
 def resolve(name: str) -> Path:

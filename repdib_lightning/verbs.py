@@ -10,6 +10,12 @@ from typing import Any, NoReturn, get_type_hints
 
 from repdib_lightning.errors import UserError, nearest
 
+SUITE_VERBS = {
+    "run": "repdib_lightning.experiments.run:run_suite",
+    "status": "repdib_lightning.experiments.run:suite_status",
+    "report": "repdib_lightning.experiments.report:report_suite",
+}
+
 
 def collect(arguments: list[str]) -> int:
     """``collect ENVIRONMENT PATH [options]``."""
@@ -70,6 +76,13 @@ def compare(arguments: list[str]) -> int:
     return 0
 
 
+def suite(arguments: list[str]) -> int:
+    """``suite run|status|report SUITE [options]``."""
+    verb, rest = _choose("suite", "verb", SUITE_VERBS, arguments)
+    print(_call(f"suite {verb}", _load(SUITE_VERBS[verb]), rest))
+    return 0
+
+
 class _OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise UserError(f"compare: {message}")
@@ -85,7 +98,7 @@ def _comparison_options(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("data", type=Path, help="a data file with factors")
     parser.add_argument("output", type=Path, help="the HTML page to write (.html)")
     parser.add_argument("runs", nargs="+", help="runs that were exported, or bundles; NAME=PATH names one")
-    parser.add_argument("--probes", default="linear,mlp", help="linear, mlp or linear,mlp (default)")
+    parser.add_argument("--probes", default="linear,mlp", help="some of linear,mlp,decoder (default: linear,mlp)")
     parser.add_argument("--seed", type=int, default=0, help="of the MLP and of the permutation null (default: 0)")
     parser.add_argument("--device", default="auto", help="runs the encoders (default: auto, a GPU if there is one)")
     return parser.parse_args(arguments)

@@ -89,7 +89,7 @@ def encode_rows(
     codes = np.empty((len(rows), encoder.groups), np.int64) if encoder.groups else None
     starts = range(0, len(rows), batch_size)
     with torch.inference_mode():
-        for start in tqdm(starts, desc="encode", unit="batch", disable=not progress, leave=False):
+        for start in tqdm(starts, desc="encode", unit="batch", disable=None if progress else True, leave=False):
             part = slice(start, start + batch_size)
             observations = {
                 name: torch.from_numpy(gather_stacks(store, name, rows[part], encoder.spec.frame_stack)).to(device)

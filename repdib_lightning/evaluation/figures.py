@@ -14,6 +14,7 @@ from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.evaluation.tables import KINDS
 
 if TYPE_CHECKING:
+    from repdib_lightning.evaluation.decoder import Drawings
     from repdib_lightning.evaluation.probe import ProbeReport
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
@@ -142,16 +143,43 @@ def frame_strip(store: EpisodeStore, rows: np.ndarray, names: Sequence[str], cou
     axes = figure.subplots(len(views), len(chosen), squeeze=False)
     for line, view in zip(axes, views, strict=True):
         for axis, picture in zip(line, store.gather(f"observations/{view}", chosen), strict=True):
-            channels = 3 if len(picture) >= 3 else 1
-            shown = picture[:channels].transpose(1, 2, 0)
-            axis.imshow(shown if channels == 3 else shown[..., 0], cmap="gray", vmin=0, vmax=255)
-            axis.set_xticks([])
-            axis.set_yticks([])
+            _draw_picture(axis, picture)
         line[0].set_ylabel(view)
     for axis, row in zip(axes[-1], chosen, strict=True):
         axis.set_xlabel(f"row {row}", fontsize=8)
     figure.suptitle("Evaluation frames, evenly spaced over the recording: what the encoder sees", fontsize=10)
     return png(figure)
+
+
+def drawn_strip(drawings: Mapping[str, Drawings]) -> bytes:
+    """Held-out frames, and below each what the decoder drew of it from the latent of every run; a block a view."""
+    first = next(iter(drawings.values()))
+    views, columns = list(first.frames), len(first.rows)
+    lines = len(views) * (1 + len(drawings))
+    figure = Figure(figsize=(1.2 * columns + 0.8, 1.25 * lines + 0.5), layout="constrained")
+    axes = figure.subplots(lines, columns, squeeze=False)
+    place = iter(axes)
+    for view in views:
+        _draw_line(next(place), first.frames[view], f"{view}\nframe")
+        for run, drawing in drawings.items():
+            _draw_line(next(place), drawing.drawn[view], f"{view}\n{run}")
+    figure.suptitle("Held-out frames, and what each latent still tells of them", fontsize=11)
+    return png(figure)
+
+
+def _draw_line(axes: Sequence[Axes], pictures: np.ndarray, label: str) -> None:
+    for axis, picture in zip(axes, pictures, strict=True):
+        _draw_picture(axis, picture)
+    axes[0].set_ylabel(label, fontsize=9)
+
+
+def _draw_picture(axis: Axes, picture: np.ndarray) -> None:
+    """(C, H, W) uint8; of a stack of frames the first one."""
+    channels = 3 if len(picture) >= 3 else 1
+    shown = picture[:channels].transpose(1, 2, 0)
+    axis.imshow(shown if channels == 3 else shown[..., 0], cmap="gray", vmin=0, vmax=255)
+    axis.set_xticks([])
+    axis.set_yticks([])
 
 
 def principal_plane(latents: np.ndarray) -> np.ndarray:

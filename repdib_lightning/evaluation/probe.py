@@ -20,8 +20,10 @@ from repdib_lightning.data.schema import FactorSpec
 from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation.bundles import bundle_of, display_name, protected_files
 from repdib_lightning.evaluation.codes import CodebookUse, FactorBits, codebook_use, factor_bits
+from repdib_lightning.evaluation.decoder import Drawings, PictureReport, check_pictures, measure_pictures
 from repdib_lightning.evaluation.features import Encodes, check_compatible, encode_rows, resolve_device
 from repdib_lightning.evaluation.probes import (
+    DECODER,
     PROBES,
     Half,
     ProbeScore,
@@ -30,7 +32,9 @@ from repdib_lightning.evaluation.probes import (
     chance,
     check_probes,
     measure,
+    one_thread,
 )
+from repdib_lightning.evaluation.samples import MOST, ProbeSamples
 from repdib_lightning.evaluation.splits import ProbeSplit, split_evaluation
 from repdib_lightning.evaluation.tables import report_table
 from repdib_lightning.word_lists import words
@@ -79,6 +83,7 @@ class ProbeReport:
         fit_rows, score_rows: how many rows each half holds.
         factors: name -> report, endogenous first.
         codebook: use of codes on all evaluation rows; None where nothing is quantised.
+        pictures: what the decoder probe drew again; None where it was not asked for.
     """
 
     name: str
@@ -93,6 +98,7 @@ class ProbeReport:
     score_rows: int
     factors: dict[str, FactorReport]
     codebook: CodebookUse | None
+    pictures: PictureReport | None = None
 
     def mean_kept(self, kind: Kind, probe: str) -> float | None:
         """Mean *kept* over the factors of a kind; None if there is none, or none that varies."""
@@ -143,6 +149,7 @@ def probe_bundle(
     data: Path,
     *,
     output: Path | None = None,
+    samples: Path | None = None,
     probes: str | Sequence[str] = ",".join(PROBES),
     device: str = "auto",
     seed: int = 0,
@@ -154,10 +161,11 @@ def probe_bundle(
         bundle: folder of an exported encoder, or of a run that holds one.
         data: a store with factors and at least two evaluation episodes.
         output: the JSON file (.json); ``probe.json`` in the bundle by default.
-        probes: ``linear``, ``mlp`` or ``linear,mlp``.
+        samples: also keep some latents, their factors and drawn pictures in this file (.npz), for figures.
+        probes: ``linear``, ``mlp``, ``decoder`` (draws the pictures again from the latent), or several between commas.
         device: runs the encoder; the probes run on the CPU.
         seed: of the MLP and of the permutation null.
-        progress: show progress bars.
+        progress: show progress bars (on a terminal).
 
     Raises:
         UserError: bad bundle or data, observations that do not match, no factors, too few evaluation episodes, or an
@@ -168,12 +176,27 @@ def probe_bundle(
     target = folder / "probe.json" if output is None else Path(output)
     encoder = load_for_probing(folder, device)
     check_output_file(target, "--output", ".json", [Path(data), *protected_files(folder)])
+    if samples is not None:
+        check_output_file(Path(samples), "--samples", ".npz", [Path(data)])
     store = open_for_probing(data)
+    if DECODER in chosen:
+        check_pictures(store)
     check_compatible(encoder, store, str(folder))
     encoded = encode_evaluation(encoder, store, device=encoder.device, progress=progress)
-    report = probe_encoded(encoded, store, name=display_name(folder), probes=chosen, seed=seed, progress=progress)
+    name = display_name(folder)
+    report, drawings = probe_encoded(encoded, store, name=name, probes=chosen, seed=seed, progress=progress)
+    if samples is not None:
+        draw_samples(encoded, store, drawings).write(Path(samples))
     report.write(target)
     return report
+
+
+def draw_samples(encoded: Encoded, store: EpisodeStore, drawings: Drawings | None) -> ProbeSamples:
+    """Evenly spaced evaluation rows, with all factors, for figures."""
+    rows = encoded.split.rows
+    thin = np.unique(np.linspace(0, len(rows) - 1, min(MOST, len(rows))).astype(int))
+    factors = {name: store.gather(f"factors/{name}", rows[thin]) for name in store.factors}
+    return ProbeSamples(rows[thin], encoded.latents[thin], factors, drawings)
 
 
 def check_options(probes: str | Sequence[str], seed: int) -> tuple[str, ...]:
@@ -234,21 +257,26 @@ def probe_encoded(
     probes: tuple[str, ...] = PROBES,
     seed: int = 0,
     progress: bool = True,
-) -> ProbeReport:
-    """Probe latents for every factor of their store, the state's factors first."""
+) -> tuple[ProbeReport, Drawings | None]:
+    """Probe latents for every factor of their store, the state's factors first; with ``decoder``, for the pictures."""
     split = encoded.split
     rows, episodes = split.rows, store.row_episodes[split.rows]
     in_fit = np.isin(episodes, split.fit)
     features = Standardiser(encoded.latents[in_fit])(encoded.latents)
     reports = {}
+    by_factor = tuple(probe for probe in probes if probe != DECODER)
     ordered = sorted(store.factors.items(), key=lambda item: (item[1].kind, item[0]))
-    for factor, spec in tqdm(ordered, desc="probe", unit="factor", disable=not progress, leave=False):
+    for factor, spec in tqdm(ordered, desc="probe", unit="factor", disable=None if progress else True, leave=False):
         target = as_target(store.gather(f"factors/{factor}", rows), spec)
         fit = Half(features[in_fit], target[in_fit], episodes[in_fit])
         score = Half(features[~in_fit], target[~in_fit], episodes[~in_fit])
         bits = None if encoded.codes is None else factor_bits(encoded.codes, target, seed)
-        reports[factor] = _factor_report(spec, fit, score, probes, bits, seed)
-    return ProbeReport(
+        reports[factor] = _factor_report(spec, fit, score, by_factor, bits, seed)
+    pictures, drawings = None, None
+    if DECODER in probes:
+        with one_thread():
+            pictures, drawings = measure_pictures(features, store, rows, in_fit)
+    report = ProbeReport(
         name=name,
         data=store.path.name,
         fingerprint=store.fingerprint,
@@ -261,7 +289,9 @@ def probe_encoded(
         score_rows=len(split.score_rows),
         factors=reports,
         codebook=None if encoded.codes is None else codebook_use(encoded.codes, encoded.codes_per_group),
+        pictures=pictures,
     )
+    return report, drawings
 
 
 def _factor_report(

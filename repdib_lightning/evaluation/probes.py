@@ -23,6 +23,11 @@ from repdib_lightning.evaluation.mlp import Fold, Task, fit_correction
 from repdib_lightning.evaluation.splits import episode_folds
 
 PROBES = ("linear", "mlp")
+"""Probes of each factor, fitted unless others are named."""
+
+DECODER = "decoder"
+"""The probe of the pictures (:mod:`repdib_lightning.evaluation.decoder`)."""
+
 RIDGE_PENALTIES = (10.0, *PENALTIES, 1e-5, 1e-6)
 ABSENT = -1e4
 """A logit so low that its class is never predicted, and small enough for float32."""
@@ -84,10 +89,10 @@ class Standardiser:
 def check_probes(probes: tuple[str, ...]) -> None:
     """Raises UserError if a probe is unknown or none is given."""
     for name in probes:
-        if name not in PROBES:
-            raise UserError(f"probes: unknown probe '{name}', {nearest(name, PROBES)}")
-    if not probes:
-        raise UserError(f"probes: at least one is needed {nearest('', PROBES)}")
+        if name not in (*PROBES, DECODER):
+            raise UserError(f"probes: unknown probe '{name}', {nearest(name, (*PROBES, DECODER))}")
+    if not set(probes) & set(PROBES):
+        raise UserError(f"probes: at least one of the factors is needed {nearest('', PROBES)}")
 
 
 def as_target(values: np.ndarray, spec: FactorSpec) -> np.ndarray:
@@ -110,7 +115,7 @@ def measure(probe: str, fit: Half, score: Half, seed: int) -> ProbeScore:
 
     A class that occurs only in the score half cannot be predicted, so its rows count as wrong.
     """
-    with _one_thread():
+    with one_thread():
         mapping, choice = _mapping(probe, fit, seed)
         predicted = fit.linear.decode(mapping(score.features))
     if fit.target.ndim == 1:
@@ -121,7 +126,7 @@ def measure(probe: str, fit: Half, score: Half, seed: int) -> ProbeScore:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """Probes are so small that a second thread gains nothing, costs 10x on a busy machine, and moves last digits."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)

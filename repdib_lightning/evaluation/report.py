@@ -18,6 +18,7 @@ from repdib_lightning.data.outputs import check_output_file
 from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation import curves, figures
 from repdib_lightning.evaluation.bundles import protected_files
+from repdib_lightning.evaluation.decoder import Drawings
 from repdib_lightning.evaluation.features import check_compatible
 from repdib_lightning.evaluation.probe import (
     Encoded,
@@ -60,6 +61,7 @@ class RunResult:
         report: what it kept. encoded: its evaluation latents, or None to leave out the scatter.
         description: plain facts of encoder, bottleneck and training (the bundle's ``config.json``).
         metrics: the run's ``metrics.csv``, or None. bundle: the folder to load it from.
+        drawings: pictures drawn again from the latents, or None.
     """
 
     report: ProbeReport
@@ -67,6 +69,7 @@ class RunResult:
     description: Mapping[str, Any] | None = None
     metrics: Path | None = None
     bundle: Path | None = None
+    drawings: Drawings | None = None
 
 
 def compare(
@@ -108,8 +111,9 @@ def compare(
     runs = {}
     for name, encoder in encoders.items():
         encoded = encode_evaluation(encoder, store, device=encoder.device, progress=progress)
-        report = probe_encoded(encoded, store, name=name, probes=chosen, seed=seed, progress=progress)
-        runs[name] = RunResult(report, encoded, encoder.description, metrics.get(name), Path(bundles[name]))
+        report, drawings = probe_encoded(encoded, store, name=name, probes=chosen, seed=seed, progress=progress)
+        place = Path(bundles[name])
+        runs[name] = RunResult(report, encoded, encoder.description, metrics.get(name), place, drawings)
     write_comparison(output, runs, store, title=title)
     reports = {name: run.report for name, run in runs.items()}
     return "\n".join([comparison_table(reports).text(), "", *notes(reports)])
@@ -178,6 +182,7 @@ def comparison_sections(runs: Mapping[str, RunResult], store: EpisodeStore) -> l
     strip = figures.frame_strip(store, _evaluation_rows(store), list(store.observations))
     drawn = {
         "What the encoder sees": strip,
+        "What can be drawn again from the latent": _drawings(runs),
         "Bits in each group of codes": figures.bits_map(reports),
         "Use of the codebooks": figures.codebook_bars(reports),
         "The latents in two dimensions (PCA)": _scatter(runs, store),
@@ -229,6 +234,11 @@ def _evaluation_rows(store: EpisodeStore) -> np.ndarray:
 def _curves(runs: Mapping[str, RunResult]) -> bytes | None:
     files = {name: run.metrics for name, run in runs.items() if run.metrics is not None}
     return curves.training_curves(files) if files else None
+
+
+def _drawings(runs: Mapping[str, RunResult]) -> bytes | None:
+    drawn = {name: run.drawings for name, run in runs.items() if run.drawings is not None}
+    return figures.drawn_strip(drawn) if drawn else None
 
 
 def _scatter(runs: Mapping[str, RunResult], store: EpisodeStore) -> bytes | None:

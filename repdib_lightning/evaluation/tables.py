@@ -74,8 +74,17 @@ def report_table(report: ProbeReport) -> str:
             for probe in report.probes:
                 row += ["", number(report.mean_kept(kind, probe))]
             rows.append(row + [""] * (report.codebook is not None))
+    if report.pictures is not None:
+        rows += [_picture_row(report, name) for name in report.pictures.regions]
     table = Table(header, rows, (first_mean,)).text()
     return "\n".join([table, "", *notes({report.name: report})])
+
+
+def _picture_row(report: ProbeReport, region: str) -> list[str]:
+    assert report.pictures is not None
+    score = report.pictures.regions[region]
+    row = [f"picture: {region}", "", "error", number(1.0), number(score.error), number(score.kept)]
+    return row + ["", ""] * (len(report.probes) - 1) + [""] * (report.codebook is not None)
 
 
 def _bits_cell(report: ProbeReport, name: str) -> list[str]:
@@ -104,6 +113,9 @@ def comparison_table(reports: dict[str, ProbeReport]) -> Table:
         rows.append(_mean_row(reports, kind, word, probes))
         if len(reports) > 1:
             rows.append(_ratio_row(reports, kind, word, probes))
+    if first.pictures is not None:
+        rules.append(len(rows))
+        rows += [_region_row(reports, region, probes) for region in first.pictures.regions]
     rules.append(len(rows))
     rows.append(_codes_row(reports, probes))
     return Table(header, rows, tuple(r for r in rules if r))
@@ -137,6 +149,15 @@ def _ratio_row(reports: dict[str, ProbeReport], kind: Kind, word: str, probes: l
     return row
 
 
+def _region_row(reports: dict[str, ProbeReport], region: str, probes: list[str]) -> list[str]:
+    row = [f"picture: {region} (error)", number(1.0)]
+    for report in reports.values():
+        assert report.pictures is not None, "all runs of a comparison get the same probes"
+        score = report.pictures.regions[region]
+        row += [number(score.error), number(score.kept), *[""] * (len(probes) - 1)]
+    return row
+
+
 def _codes_row(reports: dict[str, ProbeReport], probes: list[str]) -> list[str]:
     row = ["codes used per group", ""]
     for report in reports.values():
@@ -158,6 +179,11 @@ def notes(reports: dict[str, ProbeReport]) -> list[str]:
         lines.append(
             f"Only {len(first.fit_episodes)} fit episode(s): what drifts slowly over the recording must be "
             "extrapolated, so what was kept of it is understated. Use data with more evaluation episodes."
+        )
+    if first.pictures is not None:
+        lines.append(
+            "picture: squared error of a decoder from the latent, relative to the mean picture; kept = 1 - error, "
+            "in the column of the first probe."
         )
     for name, report in reports.items():
         use = report.codebook

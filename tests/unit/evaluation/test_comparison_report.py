@@ -34,7 +34,7 @@ def runs(store):
     runs = {}
     for name, encoder in encoders.items():
         encoded = encode_evaluation(encoder, store, progress=False)
-        report = probe_encoded(encoded, store, name=name, probes=("linear",), progress=False)
+        report, _ = probe_encoded(encoded, store, name=name, probes=("linear",), progress=False)
         runs[name] = RunResult(report, encoded, {"encoder": {"class": "A & B"}})
     return runs
 

@@ -34,7 +34,7 @@ def store(tmp_path_factory):
 
 def probed(encoder, store, **options):
     encoded = encode_evaluation(encoder, store, progress=False)
-    return probe_encoded(encoded, store, name="fake", progress=False, **options)
+    return probe_encoded(encoded, store, name="fake", progress=False, **options)[0]
 
 
 def kept(report, probe):

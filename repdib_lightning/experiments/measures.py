@@ -1,0 +1,89 @@
+"""The numbers of one finished point, by name: what training logged last, and what the probes read."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from repdib_lightning.errors import UserError
+from repdib_lightning.evaluation.curves import read_curves
+from repdib_lightning.evaluation.tables import KINDS
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a point's record takes over from its run's folder.
+
+    Attributes:
+        configuration: config.yaml as a tree. versions, data: of environment.json.
+        factors: name -> ``state`` or ``noise``.
+        metrics: name -> number; see :func:`collect_measures`.
+    """
+
+    configuration: dict[str, Any]
+    versions: dict[str, str]
+    data: dict[str, str]
+    factors: dict[str, str]
+    metrics: dict[str, float]
+
+
+def collect_measures(run: Path, probe: Path) -> Facts:
+    """Read a finished run's folder.
+
+    The measures are
+
+    - ``PROBE/FACTOR/kept``: (score - chance) / (1 - chance) of a probe on held-out episodes, between 0 and 1;
+    - ``PROBE/FACTOR/error``: 1 - accuracy, or 1 - R2, of the same probe;
+    - ``PROBE/state/kept``, ``PROBE/noise/kept``: means over the factors of that kind;
+    - ``decoder/background/kept``, ``.../error``, and the same for ``agent``: of the pictures
+      (:mod:`repdib_lightning.evaluation.decoder`);
+    - ``codes/used``, ``codes/perplexity``: means over the groups, on held-out episodes;
+    - ``val/...``: what the last validation logged.
+
+    Raises:
+        UserError: a file is missing or is not what this package writes.
+    """
+    try:
+        configuration = yaml.safe_load((run / "config.yaml").read_text())
+        environment = json.loads((run / "environment.json").read_text())
+        report = json.loads(probe.read_text())
+        factors = {name: KINDS[content["kind"]] for name, content in report["factors"].items()}
+        metrics = {**_trained(run), **_probed(report)}
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        raise UserError(f"{run}: not a finished and probed run ({type(error).__name__}: {error})") from error
+    return Facts(configuration, environment["versions"], environment["data"], factors, metrics)
+
+
+def _trained(run: Path) -> dict[str, float]:
+    curves = read_curves(run / "metrics.csv")
+    return {name: float(points[-1, 1]) for name, points in curves.items() if name.startswith("val/")}
+
+
+def _probed(report: dict[str, Any]) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for factor, content in report["factors"].items():
+        for probe, score in content["probes"].items():
+            _add(found, f"{probe}/{factor}/kept", score["kept"])
+            if score["score"] is not None:
+                _add(found, f"{probe}/{factor}/error", 1.0 - score["score"])
+    for kind, by_probe in report["summary"].items():
+        for probe, kept in by_probe.items():
+            _add(found, f"{probe}/{KINDS[kind]}/kept", kept)
+    for region, score in (report.get("pictures") or {}).get("regions", {}).items():
+        for name in ("kept", "error", "rmse"):
+            _add(found, f"decoder/{region}/{name}", score[name])
+    if report["codebook"] is not None:
+        _add(found, "codes/used", float(np.mean(report["codebook"]["used"])))
+        _add(found, "codes/perplexity", float(np.mean(report["codebook"]["perplexity"])))
+    return found
+
+
+def _add(found: dict[str, float], name: str, value: float | None) -> None:
+    """A measure that means nothing (a factor that does not vary) is left out."""
+    if value is not None:
+        found[name] = float(value)

@@ -1,0 +1,188 @@
+"""One point of a suite: a setting and a seed, its folder, and the JSON line that tells what became of it."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from repdib_lightning.callbacks.status_file import read_status
+from repdib_lightning.data.files import whole_file
+from repdib_lightning.errors import UserError
+from repdib_lightning.experiments.suite import Setting, Suite
+
+PHASES = ("fit", "export", "probe")
+"""Verbs that every point goes through, in this order."""
+
+State = Literal["waiting", "queued", "running", "stopped", "failed", "finished"]
+
+
+@dataclass
+class Record:
+    """What is known of a point; written as one JSON line.
+
+    Attributes:
+        suite, grid, setting, seed: which point.
+        arguments: of ``fit``, without the run's folder; a point keeps them for life.
+        seconds: phase -> wall seconds, over all attempts.
+        error: one line, where the last attempt failed.
+        job: of the cluster's queue, or empty.
+        finished: whether every phase is done; only then are the following filled in.
+        configuration: everything that the run used. versions: of the packages. data: file and fingerprint.
+        threads: that each process had.
+        factors: name -> ``state`` or ``noise``.
+        metrics: measure -> number (see :mod:`repdib_lightning.experiments.measures`).
+    """
+
+    suite: str
+    grid: str
+    setting: str
+    seed: int
+    arguments: list[str]
+    seconds: dict[str, float] = field(default_factory=dict)
+    error: str = ""
+    job: str = ""
+    finished: bool = False
+    configuration: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    data: dict[str, str] = field(default_factory=dict)
+    threads: int = 0
+    factors: dict[str, str] = field(default_factory=dict)
+    metrics: dict[str, float] = field(default_factory=dict)
+
+    def line(self) -> str:
+        """The JSON line."""
+        return json.dumps(asdict(self), allow_nan=False)
+
+
+@dataclass(frozen=True)
+class Point:
+    """A setting with a seed.
+
+    Attributes:
+        suite, setting, seed: which one. folder: of its run; ``<folder>.json`` and ``<folder>.log`` lie beside it.
+    """
+
+    suite: Suite
+    setting: Setting
+    seed: int
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """``bottleneck/none seed 0``."""
+        return f"{self.setting.place} seed {self.seed}"
+
+    @property
+    def log(self) -> Path:
+        """What its commands printed."""
+        return self.folder.with_name(self.folder.name + ".log")
+
+    @property
+    def file(self) -> Path:
+        """Its record."""
+        return self.folder.with_name(self.folder.name + ".json")
+
+    @property
+    def arguments(self) -> list[str]:
+        """Of ``fit``, without the run's folder."""
+        return self.setting.arguments(self.seed)
+
+    def record(self) -> Record:
+        """Read what is known of this point.
+
+        Raises:
+            UserError: the file is damaged, or the folder holds a run with other options.
+        """
+        if not self.file.is_file():
+            return Record(self.suite.name, self.setting.grid, self.setting.name, self.seed, self.arguments)
+        try:
+            record = Record(**json.loads(self.file.read_text()))
+        except (OSError, TypeError, ValueError) as error:
+            raise UserError(f"{self.file}: not a suite's record ({error}); remove it and {self.folder}") from error
+        if record.arguments != self.arguments:
+            was, now = _first_difference(record.arguments, self.arguments)
+            raise UserError(
+                f"{self.folder}: was run with other options ({was or 'nothing'} then, {now or 'nothing'} now); remove "
+                "it, or give the suite's new settings another name"
+            )
+        return record
+
+    def write(self, record: Record) -> None:
+        """Write the record, whole."""
+        with whole_file(self.file) as path:
+            path.write_text(record.line() + "\n")
+
+    def state(self) -> tuple[State, str]:
+        """How it stands, and a word more: the phase, the step, or the error."""
+        record = self.record()
+        if record.finished:
+            return "finished", ""
+        run = read_status(self.folder) if self.folder.is_dir() else None
+        step = f"step {run.step}" if run is not None and run.step else ""
+        if self._is_locked():
+            trained = run is not None and run.state == "finished"
+            exported = (self.folder / "bundle").is_dir()
+            return "running", "probe" if exported else "export" if trained else f"fit {step}".strip()
+        if record.error:
+            return "failed", record.error
+        if record.job:
+            return "queued", f"job {record.job}"
+        return ("stopped", step) if run is not None else ("waiting", "")
+
+    @contextmanager
+    def lock(self) -> Iterator[int | None]:
+        """Hold this point alone: yields a descriptor for child processes to inherit, or None if another has it.
+
+        The kernel lets go of it when the last process that holds it ends, however it ends.
+        """
+        self.folder.parent.mkdir(parents=True, exist_ok=True)
+        with open(self._lock_file, "w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                yield None
+                return
+            os.set_inheritable(file.fileno(), True)
+            yield file.fileno()
+
+    @property
+    def _lock_file(self) -> Path:
+        return self.folder.with_name(f".{self.folder.name}.lock")
+
+    def _is_locked(self) -> bool:
+        if not self._lock_file.is_file():
+            return False
+        with open(self._lock_file) as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+        return False
+
+
+def points_of(suite: Suite, seeds: Iterable[int], root: Path, only: Iterable[str] = ()) -> list[Point]:
+    """Every point of a suite once, all settings of a seed before the next seed.
+
+    Args:
+        suite: the suite. seeds: to use. root: folder of all suites' runs.
+        only: ``grid``, ``grid/setting`` or ``setting``; everything by default.
+    """
+    chosen = [setting for setting in suite.settings if _wanted(setting, tuple(only))]
+    place = root / suite.name
+    return [Point(suite, setting, seed, place / setting.place / f"seed_{seed}") for seed in seeds for setting in chosen]
+
+
+def _wanted(setting: Setting, only: tuple[str, ...]) -> bool:
+    return not only or any(word in (setting.grid, setting.name, setting.place) for word in only)
+
+
+def _first_difference(before: list[str], now: list[str]) -> tuple[str, str]:
+    longest = max(len(before), len(now))
+    padded = [words + [""] * (longest - len(words)) for words in (before, now)]
+    return next((a, b) for a, b in zip(*padded, strict=True) if a != b)
