@@ -59,4 +59,4 @@ def _leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         for key, value in tree.items():
             yield from _leaves(value, f"{prefix}.{key}" if prefix else str(key))
     else:
-        yield prefix, tree
+        yield prefix, None if tree == {} else tree  # a class without options: {} once saved, absent when parsed again

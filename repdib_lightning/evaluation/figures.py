@@ -212,7 +212,7 @@ def latent_scatter(latents: Mapping[str, np.ndarray], colourings: Mapping[str, t
             classes = np.issubdtype(values.dtype, np.integer)
             dots = axis.scatter(*plane.T, c=values, cmap="turbo" if classes else "viridis", s=6, linewidths=0)
             if classes:
-                _number_classes(axis, plane, values)
+                number_classes(axis, plane, values)
             else:
                 figure.colorbar(dots, ax=axis, shrink=0.8)
             axis.set_title(f"{run}, by {factor}\n({hints[kind]})", fontsize=9)
@@ -221,7 +221,7 @@ def latent_scatter(latents: Mapping[str, np.ndarray], colourings: Mapping[str, t
     return png(figure)
 
 
-def _number_classes(axis: Axes, plane: np.ndarray, values: np.ndarray) -> None:
+def number_classes(axis: Axes, plane: np.ndarray, values: np.ndarray) -> None:
     """Numbers make classes readable without telling colours apart."""
     classes = np.unique(values)
     if len(classes) > 40:

@@ -61,7 +61,8 @@ def collect_measures(run: Path, probe: Path) -> Facts:
 
 def _trained(run: Path) -> dict[str, float]:
     curves = read_curves(run / "metrics.csv")
-    return {name: float(points[-1, 1]) for name, points in curves.items() if name.startswith("val/")}
+    wanted = [name for name in curves if name.startswith("val/") and "/group_" not in name]
+    return {name: float(curves[name][-1, 1]) for name in wanted}
 
 
 def _probed(report: dict[str, Any]) -> dict[str, float]:

@@ -6,7 +6,7 @@ import itertools
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +68,40 @@ class Grid:
 
 
 @dataclass(frozen=True)
+class HeadlineRow:
+    """A row of a paper's table, and what is measured for it here.
+
+    Attributes:
+        label: as the report prints it. measure: without its last part (``linear/time_step``): error and kept are shown.
+        paper: setting -> printed value, relative to the baseline.
+    """
+
+    label: str
+    measure: str
+    paper: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A sentence that the report holds against the numbers of the first grid.
+
+    Attributes:
+        text: the sentence. setting, measure: what it speaks of.
+        of: ``value`` of the setting, or its ``difference`` from or ``ratio`` to the baseline (means, seeds in pairs).
+        at_most, at_least: bounds; None for none.
+        whole_interval: whether the bound is for the whole 95 % interval instead of the mean.
+    """
+
+    text: str
+    setting: str
+    measure: str
+    of: str = "value"
+    at_most: float | None = None
+    at_least: float | None = None
+    whole_interval: bool = False
+
+
+@dataclass(frozen=True)
 class Suite:
     """Everything that a suite's file says.
 
@@ -81,7 +115,10 @@ class Suite:
         probe: further options of ``probe``.
         slurm: parameters of a SLURM job, by submitit's names.
         grids: by name, in the order of the file.
-        headline: row of the first table -> the measure it shows (see :mod:`repdib_lightning.experiments.measures`).
+        headline: rows of the first grid's table beside the paper's. claims: about the first grid.
+        measures: shown in the tables beside what the probes read (:mod:`repdib_lightning.experiments.measures`).
+        curves: columns of metrics.csv to draw.
+        show: settings of the first grid whose latents and drawn pictures are shown. colours: factors that colour them.
     """
 
     name: str
@@ -95,7 +132,12 @@ class Suite:
     probe: Mapping[str, Any]
     slurm: Mapping[str, Any]
     grids: tuple[Grid, ...]
-    headline: Mapping[str, str] = field(default_factory=dict)
+    headline: tuple[HeadlineRow, ...] = ()
+    claims: tuple[Claim, ...] = ()
+    measures: tuple[str, ...] = ()
+    curves: tuple[str, ...] = ("train/loss",)
+    show: tuple[str, ...] = ()
+    colours: tuple[str, ...] = ()
 
     @property
     def settings(self) -> list[Setting]:
@@ -149,6 +191,9 @@ def read_suite(name: str | Path) -> Suite:
     grids = tree["grids"]
     if not isinstance(grids, dict) or not grids:
         raise UserError(f"{file}: grids must map names to grids, is {grids!r:.60}")
+    built = tuple(_grid(file, name, content, base, Path(tree["data"])) for name, content in grids.items())
+    known = [setting.name for setting in built[0].settings]
+    headline = tree.get("headline")
     threads = tree.get("threads", 1)
     if not isinstance(threads, int) or threads < 1:
         raise UserError(f"{file}: threads must be at least 1, is {threads!r}")
@@ -163,9 +208,40 @@ def read_suite(name: str | Path) -> Suite:
         threads=threads,
         probe=_mapping(file, "probe", tree.get("probe")),
         slurm=_mapping(file, "slurm", tree.get("slurm")),
-        grids=tuple(_grid(file, name, content, base, Path(tree["data"])) for name, content in grids.items()),
-        headline=_mapping(file, "headline", tree.get("headline")),
+        grids=built,
+        headline=tuple(_headline_row(file, *item, known) for item in _mapping(file, "headline", headline).items()),
+        claims=tuple(_claim(file, *item, known) for item in _mapping(file, "claims", tree.get("claims")).items()),
+        measures=_words(file, "measures", tree.get("measures", [])),
+        curves=_words(file, "curves", tree.get("curves", ["train/loss"])),
+        show=_words(file, "show", tree.get("show", []), known),
+        colours=_words(file, "colours", tree.get("colours", [])),
     )
+
+
+def _headline_row(file: Path, label: str, content: Any, settings: Sequence[str]) -> HeadlineRow:
+    key = f"headline.{label}"
+    _check_keys(file, key, content, {"measure", "paper"})
+    paper = _mapping(file, f"{key}.paper", content.get("paper"))
+    for setting, value in paper.items():
+        _check_choice(file, f"{key}.paper", setting, settings)
+        _check_number(file, f"{key}.paper.{setting}", value)
+    return HeadlineRow(label, str(content.get("measure", "")), paper)
+
+
+def _claim(file: Path, text: str, content: Any, settings: Sequence[str]) -> Claim:
+    key = f"claims.{text}"
+    _check_keys(file, key, content, set(Claim.__dataclass_fields__) - {"text"})
+    for needed in ("setting", "measure"):
+        if needed not in content:
+            raise UserError(f"{file}: {key}.{needed} is missing")
+    _check_choice(file, f"{key}.setting", content["setting"], settings)
+    _check_choice(file, f"{key}.of", content.get("of", "value"), ("value", "difference", "ratio"))
+    bounds = [content[bound] for bound in ("at_most", "at_least") if content.get(bound) is not None]
+    if not bounds:
+        raise UserError(f"{file}: {key} needs at_most or at_least, a number to hold it against")
+    for bound in bounds:
+        _check_number(file, key, bound)
+    return Claim(text, **content)
 
 
 def _grid(file: Path, name: str, content: Any, base: Sequence[str], data: Path) -> Grid:
@@ -257,6 +333,25 @@ def _mapping(file: Path, key: str, value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise UserError(f"{file}: {key} must map names to values, is {value!r:.60}")
     return value
+
+
+def _words(file: Path, key: str, value: Any, choices: Sequence[str] | None = None) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(word, str) for word in value):
+        raise UserError(f"{file}: {key} must be a list of words, is {value!r:.60}")
+    for word in value:
+        if choices is not None:
+            _check_choice(file, key, word, choices)
+    return tuple(value)
+
+
+def _check_choice(file: Path, key: str, word: Any, choices: Sequence[str]) -> None:
+    if word not in choices:
+        raise UserError(f"{file}: {key}: '{word}' is not known {nearest(str(word), choices)}")
+
+
+def _check_number(file: Path, key: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise UserError(f"{file}: {key} must be a number, is {value!r:.60}")
 
 
 def _check_keys(file: Path, where: str, tree: Any, known: set[str]) -> None:

@@ -1,0 +1,118 @@
+"""The paper's table beside ours, in both readings of "error"; and claims held against the numbers."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.experiments import statistics
+from repdib_lightning.experiments.results import Results
+from repdib_lightning.experiments.statistics import Estimate
+from repdib_lightning.experiments.suite import Claim, Grid, HeadlineRow
+
+READINGS = {"error": "error of predicting it", "kept": "how much of it is kept"}
+"""Last part of a measure -> what a relative "error" can mean."""
+
+TIE = 0.01
+"""Relative values of the paper that differ by less than this are taken as equal when orders are compared."""
+
+
+@dataclass(frozen=True)
+class HeadlineCell:
+    """One setting in one reading: relative to the baseline (None where the baseline is zero), and as it is."""
+
+    relative: Estimate | None
+    absolute: Estimate
+
+
+@dataclass(frozen=True)
+class HeadlineLine:
+    """One row of the paper's table in one reading.
+
+    Attributes:
+        row: of the suite. reading: a key of READINGS. cells: setting -> numbers.
+        agrees: whether every pair of settings that the paper tells apart has the same order here; None where the paper
+            tells none apart, or nothing relative can be said.
+    """
+
+    row: HeadlineRow
+    reading: str
+    cells: dict[str, HeadlineCell]
+    agrees: bool | None
+
+
+def headline(results: Results) -> list[HeadlineLine]:
+    """All rows in both readings, on the first grid."""
+    grid = results.suite.grids[0]
+    return [_line(results, grid, row, reading) for row in results.suite.headline for reading in READINGS]
+
+
+def _line(results: Results, grid: Grid, row: HeadlineRow, reading: str) -> HeadlineLine:
+    measure = f"{row.measure}/{reading}"
+    _check_measure(results, grid, measure, f"headline.{row.label}")
+    baseline = next(setting for setting in grid.settings if setting.name == grid.baseline)
+    cells = {}
+    for setting in grid.settings:
+        ours, theirs = results.paired(setting, baseline, measure)
+        if len(ours):
+            cells[setting.name] = HeadlineCell(statistics.paired_ratio(ours, theirs), statistics.mean(ours))
+    return HeadlineLine(row, reading, cells, _agrees(row, cells))
+
+
+def _agrees(row: HeadlineRow, cells: dict[str, HeadlineCell]) -> bool | None:
+    told = []
+    for first, second in itertools.combinations([name for name in row.paper if name in cells], 2):
+        gap = row.paper[first] - row.paper[second]
+        ours = [cells[name].relative for name in (first, second)]
+        if abs(gap) < TIE or ours[0] is None or ours[1] is None:
+            continue
+        told.append((ours[0].value - ours[1].value) * gap > 0)
+    return all(told) if told else None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A claim, the number that it is about, and whether it holds (None: no interval, or nothing to divide by)."""
+
+    claim: Claim
+    estimate: Estimate | None
+    holds: bool | None
+
+
+def verdicts(results: Results) -> list[Verdict]:
+    """Every claim of the suite, on the first grid."""
+    return [_verdict(results, results.suite.grids[0], claim) for claim in results.suite.claims]
+
+
+def _verdict(results: Results, grid: Grid, claim: Claim) -> Verdict:
+    _check_measure(results, grid, claim.measure, f"claims.{claim.text}")
+    by_name = {setting.name: setting for setting in grid.settings}
+    ours, theirs = results.paired(by_name[claim.setting], by_name[grid.baseline], claim.measure)
+    if not len(ours):
+        return Verdict(claim, None, None)
+    estimate = _estimate(claim, ours, theirs)
+    if estimate is None:
+        return Verdict(claim, None, None)
+    if claim.whole_interval and (estimate.low is None or estimate.high is None):
+        return Verdict(claim, estimate, None)
+    highest = estimate.high if claim.whole_interval else estimate.value
+    lowest = estimate.low if claim.whole_interval else estimate.value
+    assert highest is not None and lowest is not None
+    below = claim.at_most is None or highest <= claim.at_most
+    above = claim.at_least is None or lowest >= claim.at_least
+    return Verdict(claim, estimate, below and above)
+
+
+def _estimate(claim: Claim, ours: np.ndarray, theirs: np.ndarray) -> Estimate | None:
+    if claim.of == "difference":
+        return statistics.paired_difference(ours, theirs)
+    return statistics.paired_ratio(ours, theirs) if claim.of == "ratio" else statistics.mean(ours)
+
+
+def _check_measure(results: Results, grid: Grid, measure: str, key: str) -> None:
+    known = results.measures(grid)
+    if measure not in known:
+        raise UserError(f"{results.suite.file}: {key}: no point has the measure '{measure}' {nearest(measure, known)}")

@@ -1,0 +1,61 @@
+"""A suite's report as text: its parts, as Markdown and as sections of the HTML page."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from repdib_lightning.evaluation.report import Section, picture
+from repdib_lightning.evaluation.tables import Table
+from repdib_lightning.experiments.results import Results
+from repdib_lightning.experiments.tables import markdown
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of the report: a heading with sentences, tables and figures (file name -> PNG)."""
+
+    title: str
+    sentences: list[str]
+    tables: list[Table]
+    figures: dict[str, bytes]
+
+
+def facts_of(results: Results) -> list[str]:
+    """Sentences on what was run, with what, for how long, and what is missing."""
+    first = next(iter(results.records.values()))
+    versions = ", ".join(f"{name} {number}" for name, number in first.versions.items())
+    seconds = sum(sum(record.seconds.values()) for record in results.records.values())
+    facts = [
+        f"{len(results.records)} runs of suite '{results.suite.name}', seeds {', '.join(map(str, results.seeds))}, on "
+        f"{first.data.get('file')} (fingerprint {first.data.get('fingerprint')}), {first.threads} thread(s) each, "
+        f"{seconds / 3600:.1f} hours of run time in all.",
+        f"Versions: {versions}.",
+        "Probes are fitted on some held-out episodes and scored on others. Intervals: 95 %, bootstrap over seeds "
+        "(percentile, 10,000 resamples); with five seeds they are somewhat too narrow.",
+    ]
+    if results.missing:
+        facts.append(f"NOT FINISHED, and left out: {', '.join(results.missing)}.")
+    others = {json.dumps(record.versions) for record in results.records.values()}
+    if len(others) > 1:
+        facts.append("The runs were made with different versions; points.jsonl has each one's.")
+    return facts
+
+
+def as_markdown(title: str, facts: Sequence[str], parts: Sequence[Part]) -> str:
+    """The whole report; figures are files beside it."""
+    blocks = [f"# {title}", *facts]
+    for part in parts:
+        blocks += [f"## {part.title}", *part.sentences, *[markdown(table) for table in part.tables]]
+        blocks += [f"![{name}]({name}.png)" for name in part.figures]
+    return "\n\n".join(blocks) + "\n"
+
+
+def as_section(part: Part) -> Section:
+    """One part of the HTML page, its figures inside."""
+    body = [f"<p>{html.escape(sentence)}</p>" for sentence in part.sentences]
+    body += [f'<div class="wide">{table.html()}</div>' for table in part.tables]
+    body += [picture(content, name) for name, content in part.figures.items()]
+    return Section(part.title, "\n".join(body))

@@ -1,0 +1,94 @@
+"""The finished points of a suite, and their numbers by setting and seed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from repdib_lightning.errors import UserError
+from repdib_lightning.experiments.points import Point, Record, points_of
+from repdib_lightning.experiments.suite import Grid, Setting, Suite
+
+
+@dataclass(frozen=True)
+class Results:
+    """Finished points.
+
+    Attributes:
+        suite: whose they are. seeds: asked for.
+        points: (place of a setting, seed) -> point. records: the same -> record.
+        missing: names of points that are not finished.
+    """
+
+    suite: Suite
+    seeds: tuple[int, ...]
+    points: dict[tuple[str, int], Point]
+    records: dict[tuple[str, int], Record]
+    missing: list[str]
+
+    def point(self, setting: Setting, seed: int) -> Point | None:
+        """The point whose run a setting has for a seed; None if it is not finished."""
+        return self.points.get((self.suite.run_by(setting).place, seed))
+
+    def values(self, setting: Setting, measure: str) -> dict[int, float]:
+        """Seed -> number, for the finished points that have this measure."""
+        place = self.suite.run_by(setting).place
+        found = {seed: self.records[place, seed] for seed in self.seeds if (place, seed) in self.records}
+        return {seed: record.metrics[measure] for seed, record in found.items() if measure in record.metrics}
+
+    def paired(self, ours: Setting, baseline: Setting, measure: str) -> tuple[np.ndarray, np.ndarray]:
+        """Two (n,) arrays over the seeds that both have, in the same order."""
+        first, second = self.values(ours, measure), self.values(baseline, measure)
+        common = [seed for seed in first if seed in second]
+        return np.array([first[seed] for seed in common]), np.array([second[seed] for seed in common])
+
+    @property
+    def factors(self) -> dict[str, str]:
+        """Name -> ``state`` or ``noise``."""
+        return next(iter(self.records.values())).factors
+
+    def measures(self, grid: Grid) -> list[str]:
+        """Names of all measures that a setting of the grid has, in order of first appearance."""
+        names: dict[str, None] = {}
+        for setting in grid.settings:
+            for seed in self.seeds:
+                record = self.records.get((self.suite.run_by(setting).place, seed))
+                names |= dict.fromkeys(record.metrics if record else ())
+        return list(names)
+
+
+def load_results(suite: Suite, seeds: Iterable[int], runs: Path) -> Results:
+    """Read every finished point of a suite.
+
+    Raises:
+        UserError: none is finished, a record is damaged, or two runs are of different data.
+    """
+    wanted = tuple(seeds)
+    points, records, missing = {}, {}, []
+    for point in points_of(suite, wanted, runs):
+        record = point.record()
+        if record.finished:
+            points[point.setting.place, point.seed] = point
+            records[point.setting.place, point.seed] = record
+        else:
+            missing.append(point.name)
+    if not records:
+        raise UserError(
+            f"{runs / suite.name}: no point is finished; first: python -m repdib_lightning suite run {suite.name}"
+        )
+    _check_same_data(points, records)
+    return Results(suite, wanted, points, records, missing)
+
+
+def _check_same_data(points: dict[tuple[str, int], Point], records: dict[tuple[str, int], Record]) -> None:
+    """Settings may only be compared on the same data."""
+    key, first = next(iter(records.items()))
+    for other, record in records.items():
+        if record.data.get("fingerprint") != first.data.get("fingerprint"):
+            raise UserError(
+                f"{points[other].folder}: was trained on other data than {points[key].folder} (fingerprints differ); "
+                "remove one of them and run the suite again"
+            )
