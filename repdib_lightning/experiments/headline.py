@@ -90,17 +90,16 @@ def verdicts(results: Results) -> list[Verdict]:
 def _verdict(results: Results, grid: Grid, claim: Claim) -> Verdict:
     _check_measure(results, grid, claim.measure, f"claims.{claim.text}")
     by_name = {setting.name: setting for setting in grid.settings}
-    ours, theirs = results.paired(by_name[claim.setting], by_name[grid.baseline], claim.measure)
+    ours, theirs = results.paired(by_name[claim.setting], by_name[claim.than or grid.baseline], claim.measure)
     if not len(ours):
         return Verdict(claim, None, None)
     estimate = _estimate(claim, ours, theirs)
     if estimate is None:
         return Verdict(claim, None, None)
-    if claim.whole_interval and (estimate.low is None or estimate.high is None):
+    ends = (estimate.value, estimate.value) if claim.judge == "mean" else (estimate.low, estimate.high)
+    lowest, highest = ends if claim.judge != "any" else ends[::-1]
+    if lowest is None or highest is None:
         return Verdict(claim, estimate, None)
-    highest = estimate.high if claim.whole_interval else estimate.value
-    lowest = estimate.low if claim.whole_interval else estimate.value
-    assert highest is not None and lowest is not None
     below = claim.at_most is None or highest <= claim.at_most
     above = claim.at_least is None or lowest >= claim.at_least
     return Verdict(claim, estimate, below and above)

@@ -59,7 +59,7 @@ def _headline_part(results: Results) -> list[Part]:
     lines, found = headline(results), verdicts(results)
     shown = [tables.headline_table(results, lines), tables.absolute_table(results, lines)] if lines else []
     if found:
-        shown.append(tables.claims_table(found))
+        shown.append(tables.claims_table(found, suite.grids[0].baseline))
     if not shown:
         return []
     grid = suite.grids[0]
@@ -67,8 +67,8 @@ def _headline_part(results: Results) -> list[Part]:
         f"Relative to '{grid.baseline}': mean over mean, seeds in pairs, with a 95 % bootstrap interval over seeds.",
         'The paper prints a relative "error" and does not define it. Two readings: the error of a probe that predicts '
         "the factor (1 - R2; 1 - accuracy; the squared error of drawn pixels over that of the mean picture), which is "
-        "high where noise was dropped; and how much of it is kept, (score - chance) / (1 - chance), which is low there.",
-        "Paper's order: whether every two settings that the paper tells apart, by 0.01 or more, come in the same order.",
+        "high where noise was dropped; and how much of it is kept, (score - chance) / (1 - chance), then low.",
+        "Paper's order: whether any two settings that the paper tells apart, by 0.01 or more, come in the same order.",
     ]
     return [Part("The paper's table, and ours", sentences, shown, {})]
 

@@ -22,6 +22,11 @@ FIRST_DEVELOPMENT_SEED = 100
 CONFIG = "config"
 """The axis whose values are configurations instead of values of a key."""
 
+SET_BY_SUITE = ("seed_everything", "data.seed", "data.init_args.seed", "data.path", "data.init_args.path", "run")
+"""Options of ``fit`` that follow from the suite's data and seeds, so that no setting may give them."""
+
+PROBE_OPTIONS = ("probes", "device", "seed")
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -87,18 +92,20 @@ class Claim:
 
     Attributes:
         text: the sentence. setting, measure: what it speaks of.
-        of: ``value`` of the setting, or its ``difference`` from or ``ratio`` to the baseline (means, seeds in pairs).
+        of: ``value`` of the setting, or its ``difference`` from or ``ratio`` to another one (means, seeds in pairs).
+        than: that other setting; the baseline by default.
         at_most, at_least: bounds; None for none.
-        whole_interval: whether the bound is for the whole 95 % interval instead of the mean.
+        judge: whether the ``mean`` must keep the bound, the ``whole`` 95 % interval, or ``any`` of that interval.
     """
 
     text: str
     setting: str
     measure: str
     of: str = "value"
+    than: str = ""
     at_most: float | None = None
     at_least: float | None = None
-    whole_interval: bool = False
+    judge: str = "mean"
 
 
 @dataclass(frozen=True)
@@ -166,7 +173,7 @@ def find_suite(name: str | Path) -> Path:
     if Path(name).is_file():
         return Path(name)
     known = configurations.packaged_suites()
-    short = Path(name).name.removesuffix(".yaml")
+    short = str(name).removesuffix(".yaml").removeprefix("conf/suites/")
     if short not in known:
         raise UserError(f"suite {name}: no such file or packaged suite; {nearest(short, known)}")
     return known[short]
@@ -181,13 +188,15 @@ def read_suite(name: str | Path) -> Suite:
     file = find_suite(name)
     try:
         tree = yaml.safe_load(file.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+    except (yaml.YAMLError, ValueError, OSError) as error:
         raise UserError(f"{file}: not valid YAML ({str(error).splitlines()[-1].strip()})") from error
     _check_keys(file, "", tree, {"base", *Suite.__dataclass_fields__} - {"name", "file"})
     for key in ("base", "data", "grids"):
         if key not in tree:
             raise UserError(f"{file}: '{key}' is missing (needed: base, data, grids)")
-    base = [_config(file, item) for item in _listed(tree["base"])]
+    if not isinstance(tree["data"], str) or not tree["data"]:
+        raise UserError(f"{file}: data must name a store, such as data/robot_arm.h5, is {tree['data']!r:.60}")
+    base = [_config(file, "base", item) for item in _listed(tree["base"])]
     grids = tree["grids"]
     if not isinstance(grids, dict) or not grids:
         raise UserError(f"{file}: grids must map names to grids, is {grids!r:.60}")
@@ -195,18 +204,18 @@ def read_suite(name: str | Path) -> Suite:
     known = [setting.name for setting in built[0].settings]
     headline = tree.get("headline")
     threads = tree.get("threads", 1)
-    if not isinstance(threads, int) or threads < 1:
+    if type(threads) is not int or threads < 1:
         raise UserError(f"{file}: threads must be at least 1, is {threads!r}")
     return Suite(
         name=file.stem,
         title=str(tree.get("title", file.stem)),
         file=file,
         data=Path(tree["data"]),
-        collect=tuple(str(tree.get("collect", "")).split()),
+        collect=_collect(file, tree.get("collect")),
         seeds=_seeds(file, "seeds", tree.get("seeds", [0, 1, 2, 3, 4])),
         tune_seeds=_seeds(file, "tune_seeds", tree.get("tune_seeds", [100, 101, 102])),
         threads=threads,
-        probe=_mapping(file, "probe", tree.get("probe")),
+        probe=_check_keys(file, "probe", tree.get("probe") or {}, set(PROBE_OPTIONS)),
         slurm=_mapping(file, "slurm", tree.get("slurm")),
         grids=built,
         headline=tuple(_headline_row(file, *item, known) for item in _mapping(file, "headline", headline).items()),
@@ -235,7 +244,10 @@ def _claim(file: Path, text: str, content: Any, settings: Sequence[str]) -> Clai
         if needed not in content:
             raise UserError(f"{file}: {key}.{needed} is missing")
     _check_choice(file, f"{key}.setting", content["setting"], settings)
+    if "than" in content:
+        _check_choice(file, f"{key}.than", content["than"], settings)
     _check_choice(file, f"{key}.of", content.get("of", "value"), ("value", "difference", "ratio"))
+    _check_choice(file, f"{key}.judge", content.get("judge", "mean"), ("mean", "whole", "any"))
     bounds = [content[bound] for bound in ("at_most", "at_least") if content.get(bound) is not None]
     if not bounds:
         raise UserError(f"{file}: {key} needs at_most or at_least, a number to hold it against")
@@ -252,10 +264,12 @@ def _grid(file: Path, name: str, content: Any, base: Sequence[str], data: Path) 
     if not isinstance(axes, dict) or not axes or not all(isinstance(v, list) and v for v in axes.values()):
         raise UserError(f"{file}: {key}.vary must map keys to lists of values, is {axes!r:.80}")
     fixed = _mapping(file, f"{key}.with", content.get("with"))
+    _check_options(file, f"{key}.with", fixed)
+    _check_options(file, f"{key}.vary", axes)
     settings = []
     for values in itertools.product(*axes.values()):
         given = dict(zip(axes, values, strict=True))
-        configs = [*base, *(_config(file, c) for part in (fixed, given) for c in _listed(part.get(CONFIG, [])))]
+        configs = [*base, *(_config(file, key, c) for part in (fixed, given) for c in _listed(part.get(CONFIG, [])))]
         options = {k: v for part in (fixed, given) for k, v in part.items() if k != CONFIG}
         options = {"data.path": str(data), **options}
         label = "-".join(_label(axis, value) for axis, value in given.items())
@@ -274,7 +288,8 @@ def _grid(file: Path, name: str, content: Any, base: Sequence[str], data: Path) 
 def _together(configs: Sequence[str], options: Mapping[str, Any]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for name in configs:
-        tree = merged(tree, yaml.safe_load(configurations.resolve(name).read_text()) or {})
+        path = configurations.resolve(name)
+        tree = merged(tree, _mapping(path, "a configuration", yaml.safe_load(path.read_text())))
     for key, value in options.items():
         tree = with_option(tree, key, value)
     return tree
@@ -287,12 +302,29 @@ def _label(axis: str, value: Any) -> str:
     return f"{axis.rpartition('.')[2]}_{value}"
 
 
-def _config(file: Path, name: Any) -> str:
+def _config(file: Path, key: str, name: Any) -> str:
     """A configuration named in a suite: a file beside the suite's, or what ``--config`` would take."""
     beside = file.parent / str(name)
     found = str(beside) if beside.is_file() else str(name)
-    configurations.resolve(found)
+    try:
+        configurations.resolve(found)
+    except UserError as error:
+        raise UserError(f"{file}: {key}: {str(error).removeprefix('--config ')}") from error
     return found
+
+
+def _collect(file: Path, given: Any) -> tuple[str, ...]:
+    if given is not None and not isinstance(given, str):
+        raise UserError(f"{file}: collect must be words of a collect command, such as robot_arm, is {given!r:.60}")
+    return tuple((given or "").split())
+
+
+def _check_options(file: Path, key: str, options: Mapping[Any, Any]) -> None:
+    for option in options:
+        if not isinstance(option, str):
+            raise UserError(f"{file}: {key}: {option!r} is no dotted option of fit, such as model.shift")
+        if option in SET_BY_SUITE:
+            raise UserError(f"{file}: {key}: '{option}' follows from the suite's data and seeds; leave it out")
 
 
 def _seeds(file: Path, key: str, given: Any) -> tuple[int, ...]:
@@ -354,16 +386,17 @@ def _check_number(file: Path, key: str, value: Any) -> None:
         raise UserError(f"{file}: {key} must be a number, is {value!r:.60}")
 
 
-def _check_keys(file: Path, where: str, tree: Any, known: set[str]) -> None:
+def _check_keys(file: Path, where: str, tree: Any, known: set[str]) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise UserError(f"{file}: {where or 'a suite'} must map keys to values, is {tree!r:.60}")
     for key in tree:
         if key not in known:
             full = f"{where}.{key}" if where else str(key)
             raise UserError(f"{file}: unknown key '{full}' {nearest(str(key), known)}")
+    return tree
 
 
 def _check_name(file: Path, key: str, name: Any) -> None:
     """Names become folders."""
     if not isinstance(name, str) or not re.fullmatch(r"[\w.+-]+", name) or name.startswith("."):
-        raise UserError(f"{file}: {key}: '{name}' cannot name a folder; use letters, digits, '_', '-', '+' and '.'")
+        raise UserError(f"{file}: {key}: {name!r:.60} cannot name a folder; use letters, digits, '_', '-', '+' and '.'")

@@ -102,16 +102,17 @@ def difference_table(results: Results, grid: Grid, found: Sequence[Difference], 
     return Table(header, rows)
 
 
-def claims_table(found: Sequence[Verdict]) -> Table:
+def claims_table(found: Sequence[Verdict], baseline: str) -> Table:
     """Each claim, its number, and whether it holds."""
     rows = []
     for verdict in found:
         claim = verdict.claim
         bounds = [f"at most {claim.at_most}"] * (claim.at_most is not None)
         bounds += [f"at least {claim.at_least}"] * (claim.at_least is not None)
-        asked = f"{' and '.join(bounds)}{', whole interval' if claim.whole_interval else ''}"
+        asked = " and ".join(bounds) + {"mean": "", "whole": ", whole interval", "any": ", some of it"}[claim.judge]
         holds = {True: "holds", False: "FAILS", None: "cannot be told"}[verdict.holds]
-        about = f"{claim.of} of {claim.measure}, {claim.setting}"
+        other = "" if claim.of == "value" else f" against {claim.than or baseline}"
+        about = f"{claim.of} of {claim.measure}, {claim.setting}{other}"
         rows.append([claim.text, about, interval(verdict.estimate), asked, holds])
     return Table(["claim", "measured by", "found", "asked for", ""], rows)
 

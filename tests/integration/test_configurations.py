@@ -10,13 +10,15 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 sys.path.insert(0, str(Path(__file__).parent))
 from killing import command_in_processes
 
 from repdib_lightning.__main__ import VERBS, main
-from repdib_lightning.configurations import packaged
+from repdib_lightning.configurations import packaged, packaged_suites
 from repdib_lightning.environments.collect import collect_robot_arm
+from repdib_lightning.experiments.suite import read_suite
 
 ROOT = Path(__file__).parents[2]
 SMALL = ["--data.batch_size", "8", "--trainer.max_steps", "3", "--trainer.val_check_interval", "2",
@@ -91,6 +93,8 @@ def test_every_command_of_the_readme(here, monkeypatch):
     assert {command[0] for command in commands} <= set(VERBS) and len(commands) >= 8
     for command in commands:
         small: list[str] = []
+        if command[0] == "suite":
+            continue  # test_the_suite_of_the_readme, on fewer points
         if command[0] == "fit":
             small = SMALL if "--resume" not in command else ["--trainer.max_steps", "4"]
             if "bottleneck/none" not in command and "--resume" not in command:
@@ -110,6 +114,52 @@ def test_the_python_of_the_readme(here):
     names = {view: torch.zeros(2, 3, 64, 64, dtype=torch.uint8) for view in ("front", "top")}
     exec(code, names)
     assert names["latent"].shape == (2, 128) and names["codes"].shape == (2, 8)
+
+
+def test_the_suite_of_the_readme(here, capsys):
+    """The packaged suite, cut down to two points of three steps: run, status, report."""
+    commands = [command for command in readme_commands() if command[0] == "suite"]
+    assert [command[1:] for command in commands] == [[verb, "robot_arm"] for verb in ("run", "status", "report")]
+    plan = yaml.safe_load(packaged_suites()["robot_arm"].read_text())
+    steps = {"config": "steps.yaml", "trainer.max_steps": 3, "trainer.val_check_interval": 2}
+    plan["grids"] = {"bottleneck": {"with": steps, "vary": {"config": ["bottleneck/none", "bottleneck/repdib"]}}}
+    at_once = {"class_path": "RepDIB", "init_args": {"start_step": 1}}
+    Path("steps.yaml").write_text(yaml.safe_dump({"data": {"batch_size": 8}, "model": {"bottleneck": at_once}}))
+    plan |= {"seeds": [0], "claims": {text: c for text, c in plan["claims"].items() if c["setting"] == "repdib"}}
+    for row in plan["headline"].values():
+        row["paper"].pop("vq")
+    Path("robot_arm.yaml").write_text(yaml.safe_dump(plan))
+    for command in commands:
+        assert main([*command[:2], "robot_arm.yaml"]) == 0
+        assert "2 finished of 2" in capsys.readouterr().out or command[1] == "report"
+    written = {path.name for path in Path("results/robot_arm").iterdir()}
+    assert {"report.md", "report.html", "latents.png", "drawn.png", "bottleneck-codebooks.png"} <= written
+
+
+@pytest.mark.parametrize("name", packaged_suites())
+def test_every_setting_of_every_suite_is_an_option_of_fit(here, name, capsys):
+    for setting in read_suite(name).settings:
+        with pytest.raises(SystemExit) as ending:
+            main(["fit", *setting.arguments(0), "--print_config"])
+        assert ending.value.code == 0, setting.place
+    assert "seed_everything" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "results").glob("*/points.jsonl")))
+def test_results_name_no_place_of_a_machine(name):
+    for path in (ROOT / "results").glob(f"*/{name}"):
+        assert not re.search(r"/(home|root|work|tmp|Users)/", path.read_text()), path
+
+
+def test_the_tables_of_the_readme_are_those_of_the_results():
+    """Every row below the link to a report stands in that report."""
+    text = (ROOT / "README.md").read_text()
+    linked = re.findall(r"\]\((results/\w+/report\.md)\)(.*?)(?=\n## |\Z)", text, flags=re.DOTALL)
+    assert linked
+    for report, section in linked:
+        reported = (ROOT / report).read_text().splitlines()
+        rows = [line for line in section.splitlines() if line.startswith("|")]
+        assert rows and [row for row in rows if row not in reported] == []
 
 
 def test_make_targets_of_the_readme_exist():
