@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, get_type_hints
 
@@ -76,11 +77,21 @@ def compare(arguments: list[str]) -> int:
     return 0
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What a verb has to say in the end where the work itself may have failed, and its exit code."""
+
+    text: str
+    exit_code: int = 0
+
+
 def suite(arguments: list[str]) -> int:
     """``suite run|status|report SUITE [options]``."""
     verb, rest = _choose("suite", "verb", SUITE_VERBS, arguments)
-    print(_call(f"suite {verb}", _load(SUITE_VERBS[verb]), rest))
-    return 0
+    said = _call(f"suite {verb}", _load(SUITE_VERBS[verb]), rest)
+    outcome = said if isinstance(said, Outcome) else Outcome(said)
+    print(outcome.text)
+    return outcome.exit_code
 
 
 class _OneLineParser(argparse.ArgumentParser):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
+from collections.abc import Sequence
 from typing import IO
 
 from repdib_lightning.callbacks.status_file import read_status
@@ -26,11 +26,11 @@ class Attempt:
 
     Args:
         point: which one.
-        redo: the first phase to do anew although it was done, or empty.
+        job: of the cluster's queue that makes the attempt, or empty.
     """
 
-    def __init__(self, point: Point, redo: str = "") -> None:
-        self.point, self.redo = point, redo
+    def __init__(self, point: Point, job: str = "") -> None:
+        self.point, self.job = point, job
         self._process: subprocess.Popen[bytes] | None = None
         self._stopped = threading.Event()
 
@@ -40,9 +40,10 @@ class Attempt:
             if handle is None:
                 return False
             record = self.point.record()
-            if record.finished and not self.redo:
+            if record.finished:
                 return True
-            self._forget(record)
+            self._remove_stillborn()
+            record.error, record.job = "", self.job
             self.point.write(record)
             try:
                 for phase in PHASES:
@@ -50,37 +51,30 @@ class Attempt:
                 _complete(self.point, record)
             except UserError as error:
                 record.error = "" if self._stopped.is_set() else str(error)
-            record.job = ""
+            if record.finished or not self._stopped.is_set():  # a job that was stopped is back in the queue
+                record.job = ""
             self.point.write(record)
             return record.finished
 
-    def stop(self) -> None:
-        """End the running command as a preemption would, so that it can go on later."""
+    def terminate(self) -> None:
+        """End the running command as a preemption would, so that it can go on later; start no other."""
         self._stopped.set()
-        process = self._process
-        if process is None or process.poll() is not None:
-            return
-        process.send_signal(signal.SIGTERM)
-        try:
-            process.wait(_GRACE)
-        except subprocess.TimeoutExpired:
-            process.kill()
+        if self._process is not None:
+            self._process.terminate()
 
-    def _forget(self, record: Record) -> None:
-        """Remove what is to be done anew, and what a kill before the first checkpoint left."""
-        run = self.point.folder
-        redone = PHASES[PHASES.index(self.redo) :] if self.redo else ()
-        unusable = run.is_dir() and not any(run.glob("checkpoints/*.ckpt"))
-        if "fit" in redone or unusable:
-            shutil.rmtree(run, ignore_errors=True)
-            self.point.log.unlink(missing_ok=True)
-        if "export" in redone:
-            shutil.rmtree(run / "bundle", ignore_errors=True)
-        if "probe" in redone:
-            (run / PROBE_FILE).unlink(missing_ok=True)
-        for phase in redone:
-            record.seconds.pop(phase, None)
-        record.error, record.finished = "", False
+    def kill_after(self, seconds: float) -> None:
+        """Wait for the running command to end, and kill it when this takes too long."""
+        if self._process is None:
+            return
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+
+    def _remove_stillborn(self) -> None:
+        """Remove what a kill before the first checkpoint left: it cannot go on."""
+        if not any(self.point.folder.glob("checkpoints/*.ckpt")):
+            shutil.rmtree(self.point.folder, ignore_errors=True)
 
     def _phase(self, phase: str, record: Record, handle: int) -> None:
         if self._is_done(phase):
@@ -92,8 +86,6 @@ class Attempt:
             record.seconds[phase] = round(record.seconds.get(phase, 0.0) + time.monotonic() - began, 1)
         if code != 0:
             raise UserError(f"{phase} ended with exit code {code}: {last.removeprefix('error: ')}"[:500])
-        if not self._is_done(phase):
-            raise UserError(f"{phase} stopped before its end: {last}"[:500])
         self.point.write(record)
 
     def _is_done(self, phase: str) -> bool:
@@ -127,8 +119,15 @@ class Attempt:
             log.write(f"$ python -m repdib_lightning {' '.join(words)}\n".encode())
             log.flush()
             began = log.tell()
+            # In a group of its own, so that Ctrl-C does not reach it: of SIGINT it would die, on SIGTERM it saves.
             self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, pass_fds=(handle,)
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env=environment,
+                pass_fds=(handle,),
+                process_group=0,
             )
             if self._stopped.is_set():  # asked for while the process started
                 self._process.terminate()
@@ -145,21 +144,38 @@ def _last_line(log: IO[bytes], began: int) -> str:
 
 
 def _complete(point: Point, record: Record) -> None:
-    """Fill in the record of a point that went through every phase."""
+    """Fill in the record of a point that went through every phase. Raises UserError if a measure is no number."""
     facts = collect_measures(point.folder, point.folder / PROBE_FILE)
+    for name, value in facts.metrics.items():
+        if not math.isfinite(value):
+            raise UserError(f"{name} is {value}")
     record.configuration, record.versions, record.data = facts.configuration, facts.versions, facts.data
     record.factors, record.metrics, record.threads = facts.factors, facts.metrics, point.suite.threads
     record.finished = True
 
 
-def run_point(point: Point, redo: str = "") -> bool:
-    """One attempt, for executors that run it in a process of their own."""
-    return Attempt(point, redo).run()
+def stop_all(attempts: Sequence[Attempt], grace: float = _GRACE) -> None:
+    """Stop what these attempts run, all at once; what is left after ``grace`` seconds is killed."""
+    for attempt in attempts:
+        attempt.terminate()
+    deadline = time.monotonic() + grace
+    for attempt in attempts:
+        attempt.kill_after(max(0.0, deadline - time.monotonic()))
 
 
-def log_tail(path: Path, lines: int = 5) -> str:
-    """The last lines of a log, or an empty text."""
-    if not path.is_file():
-        return ""
-    text = path.read_text(errors="replace").replace("\r", "\n")
-    return "\n".join([line for line in text.splitlines() if line.strip()][-lines:])
+def forget(point: Point, redo: str) -> None:
+    """Make a phase (fit, export or probe) and what follows it undone; nothing where the point is running."""
+    with point.lock() as handle:
+        if handle is None:
+            return
+        record, redone = point.record(), PHASES[PHASES.index(redo) :]
+        record.error, record.finished = "", False
+        for phase in redone:
+            record.seconds.pop(phase, None)
+        point.write(record)
+        if "fit" in redone:
+            shutil.rmtree(point.folder, ignore_errors=True)
+            point.log.unlink(missing_ok=True)
+        if "export" in redone:
+            shutil.rmtree(point.folder / "bundle", ignore_errors=True)
+        (point.folder / PROBE_FILE).unlink(missing_ok=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import sys
 import time
@@ -16,9 +15,12 @@ from tqdm import tqdm
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.evaluation.tables import Table
+from repdib_lightning.experiments.attempt import forget
 from repdib_lightning.experiments.executors import Executor, build_executor
 from repdib_lightning.experiments.points import PHASES, Point, State, points_of
+from repdib_lightning.experiments.slurm import jobs_in_queue
 from repdib_lightning.experiments.suite import Suite, check_seeds, read_suite
+from repdib_lightning.verbs import Outcome
 from repdib_lightning.word_lists import words
 
 RUNS = Path("runs/suites")
@@ -35,7 +37,7 @@ def run_suite(
     only: str = "",
     redo: str = "",
     runs: Path = RUNS,
-) -> str:
+) -> Outcome:
     """Run every point of a suite that is not finished: fit, export, probe, each in its own folder.
 
     What was stopped, killed or failed goes on where it stopped; what is finished is left alone.
@@ -43,29 +45,37 @@ def run_suite(
     Args:
         suite: a YAML file, or the name of a packaged suite.
         executor: local (child processes) or slurm (an array job; returns when it is in the queue).
-        jobs: points at a time; by default as many as there are cores for.
+        jobs: points at a time; by default as many as there are cores for, or as the suite's slurm parameters say.
         tune: use the development seeds (100 and up) instead of the reported ones.
         seeds: other seeds than the suite's, between commas.
         only: settings or grids to run, between commas, such as none,repdib.
-        redo: do this phase (fit, export or probe) and what follows it anew.
+        redo: do this phase (fit, export or probe) and what follows it anew; the old results are removed at once.
         runs: folder of all suites' runs.
 
+    Returns:
+        How the points stand now; the exit code is 1 where one failed.
+
     Raises:
-        UserError: a bad suite or option. Points that fail do not end the others; they are counted at the end.
+        UserError: a bad suite or option. Points that fail do not end the others.
     """
     plan = read_suite(suite)
     points = chosen_points(plan, tune=tune, seeds=seeds, only=only, runs=runs)
     if redo and redo not in PHASES:
         raise UserError(f"--redo: no phase is called '{redo}' {nearest(redo, PHASES)}")
-    room = max(1, (os.cpu_count() or 1) // plan.threads) if jobs is None else jobs
-    chosen = build_executor(executor, runs / plan.name, room, plan.threads, plan.slurm)
-    todo = [point for point in points if _is_to_be_run(point, redo)]
-    prepare_data(plan)
-    chosen.submit(todo, redo)
+    chosen = build_executor(executor, runs / plan.name, jobs, plan.threads, plan.slurm)
+    unfinished = ("waiting", "stopped", "failed")
+    todo = [point for point, state, _ in standing(points) if state in unfinished or (state == "finished" and redo)]
+    if todo:
+        prepare_data(plan)
+    if redo:
+        for point in todo:
+            forget(point, redo)
     if chosen.returns_at_once:
-        return f"{len(todo)} point(s) are in the queue; python -m repdib_lightning suite status {suite}"
-    _watch(plan, chosen, points)
-    return summary(points)
+        chosen.submit(todo)
+        return Outcome(f"submitted {len(todo)}    look: python -m repdib_lightning suite status {suite}")
+    _watch(plan, chosen, points, todo)
+    failed = any(state == "failed" for _, state, _ in standing(points))
+    return Outcome(summary(points), exit_code=int(failed))
 
 
 def suite_status(suite: Path, *, tune: bool = False, seeds: str = "", only: str = "", runs: Path = RUNS) -> str:
@@ -77,8 +87,7 @@ def suite_status(suite: Path, *, tune: bool = False, seeds: str = "", only: str 
     plan = read_suite(suite)
     points = chosen_points(plan, tune=tune, seeds=seeds, only=only, runs=runs)
     rows = []
-    for point in points:
-        state, detail = point.state()
+    for point, state, detail in standing(points):
         seconds = sum(point.record().seconds.values())
         rows.append([point.setting.place, str(point.seed), state, f"{seconds:.0f}", detail[:90]])
     return "\n".join([Table(["point", "seed", "state", "seconds", ""], rows).text(), "", summary(points)])
@@ -92,16 +101,37 @@ def chosen_points(plan: Suite, *, tune: bool, seeds: str, only: str, runs: Path)
     """
     default = plan.tune_seeds if tune else plan.seeds
     try:
-        numbers = [int(word) for word in words(seeds, "--seeds")] if seeds else default
+        numbers = list(dict.fromkeys(int(word) for word in words(seeds, "--seeds"))) if seeds else default
     except ValueError as error:
         raise UserError(f"--seeds: expected numbers between commas, got '{seeds}'") from error
+    if min(numbers) < 0:
+        raise UserError(f"--seeds: must be at least 0, is {min(numbers)}")
     check_seeds(numbers, tune=tune, where="--seeds")
-    wanted = words(only, "--only") if only else ()
-    known = {name for s in plan.settings for name in (s.grid, s.name, s.place)}
+    return points_of(plan, numbers, runs, _places(plan, words(only, "--only")) if only else ())
+
+
+def _places(plan: Suite, wanted: Sequence[str]) -> list[str]:
+    """Where the runs of these grids and settings are; a setting may share a run with one of another grid."""
+    found: dict[str, list[str]] = {}
+    for setting in (setting for grid in plan.grids for setting in grid.settings):
+        for name in {setting.grid, setting.name, setting.place}:
+            found.setdefault(name, []).append(plan.run_by(setting).place)
     for word in wanted:
-        if word not in known:
-            raise UserError(f"--only: no setting or grid is called '{word}' {nearest(word, known)}")
-    return points_of(plan, numbers, runs, wanted)
+        if word not in found:
+            raise UserError(f"--only: no setting or grid is called '{word}' {nearest(word, found)}")
+    return [place for word in wanted for place in found[word]]
+
+
+def standing(points: Sequence[Point]) -> list[tuple[Point, State, str]]:
+    """How points stand. One whose job is no longer in the queue (cancelled, or its machine is gone) is stopped."""
+    states = [(point, *point.state()) for point in points]
+    if all(state != "queued" for _, state, _ in states):
+        return states
+    known = {f"job {job}" for job in jobs_in_queue()}
+    for index, (point, state, detail) in enumerate(states):
+        if state == "queued" and detail not in known:
+            states[index] = (point, "stopped", f"{detail} is not in the queue")
+    return states
 
 
 def prepare_data(plan: Suite) -> None:
@@ -115,7 +145,7 @@ def prepare_data(plan: Suite) -> None:
 
 def summary(points: Sequence[Point]) -> str:
     """``31 finished, 2 running, 2 waiting of 35 points`` and the failed ones by name."""
-    states = [(point, *point.state()) for point in points]
+    states = standing(points)
     counts = Counter(state for _, state, _ in states)
     order: tuple[State, ...] = ("finished", "running", "queued", "stopped", "failed", "waiting")
     said = ", ".join(f"{counts[state]} {state}" for state in order if counts[state])
@@ -123,19 +153,15 @@ def summary(points: Sequence[Point]) -> str:
     return "\n".join([f"{said} of {len(points)} points", *failed])
 
 
-def _is_to_be_run(point: Point, redo: str) -> bool:
-    state, _ = point.state()
-    return state in ("waiting", "stopped", "failed") or (state == "finished" and bool(redo))
-
-
-def _watch(plan: Suite, executor: Executor, points: Sequence[Point]) -> None:
-    """Show how the points stand until all have ended."""
-    told: set[str] = set()
+def _watch(plan: Suite, executor: Executor, points: Sequence[Point], todo: Sequence[Point]) -> None:
+    """Run what is to be done, and show how all points stand until it has ended."""
+    told = {point.name for point, state, _ in standing(points) if state == "finished"}
     with (
         _terminated_like_a_keyboard(),
         tqdm(total=len(points), desc=f"suite {plan.name}", unit="point", disable=not sys.stderr.isatty()) as bar,
     ):
         try:
+            executor.submit(todo)
             while True:
                 busy = executor.busy()
                 _show(bar, points, told)
@@ -172,13 +198,17 @@ def _show(bar: tqdm[None], points: Sequence[Point], told: set[str]) -> None:
 
 @contextlib.contextmanager
 def _terminated_like_a_keyboard() -> Iterator[None]:
-    """SIGTERM to this process ends its children too."""
+    """SIGTERM to this process, or the end of its terminal, ends its children too (unless ignored, as under nohup)."""
 
-    def leave(*_: object) -> None:
-        raise SystemExit(143)
+    def leave(number: int, _: object) -> None:
+        raise SystemExit(128 + number)
 
-    before = signal.signal(signal.SIGTERM, leave)
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    heeded = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
+    for number in heeded:
+        signal.signal(number, leave)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number in heeded:
+            signal.signal(number, before[number])
