@@ -8,6 +8,9 @@ as kept; on a few thousand frames it draws better than a network of transposed c
 The error of a region is the squared error of its pixels over that of the best picture that ignores the latent: of the
 mean picture for the agent's pixels, and of the mean background (each pixel's mean over the frames where the agent does
 not cover it) for all others. ``kept`` is 1 - error, between 0 and 1.
+
+A latent that does not tell where the agent stands draws a faint trace of it into the background, which counts as error
+there: on the robot arm, whose arm covers 3 % of the pixels, at most 0.01.
 """
 
 from __future__ import annotations
@@ -87,7 +90,8 @@ def measure_pictures(
     inside = inside[np.unique(np.linspace(0, len(inside) - 1, min(MOST_ROWS, len(inside))).astype(int))]
     outside = np.flatnonzero(~in_fit)
     targets = {view: _flat(store, view, rows[inside]) for view in views}
-    means = {view: target.mean(0) for view, target in targets.items()}
+    # Summed in float64, the mean of pixels that never vary is exact: rounding must not pass for variance.
+    means = {view: target.mean(0, dtype=np.float64).astype(np.float32) for view, target in targets.items()}
     gram = sum(_gram(targets[view] - means[view]) for view in views)
     folds = episode_folds(store.row_episodes[rows[inside]])
     decoder = fit_kernel_ridge(features[inside], gram, folds)  # type: ignore[arg-type]
@@ -137,7 +141,8 @@ def _mean_background(target: np.ndarray, mask: np.ndarray, mean: np.ndarray) -> 
     """Each pixel's mean over the frames where the agent does not cover it; its plain mean if it always does."""
     free = ~_covered(mask, target.shape[1])
     counts = free.sum(0)
-    return np.where(counts > 0, np.sum(target * free, 0) / np.maximum(counts, 1), mean)
+    total = np.sum(target * free, 0, dtype=np.float64)
+    return np.where(counts > 0, total / np.maximum(counts, 1), mean).astype(np.float32)
 
 
 def _add(

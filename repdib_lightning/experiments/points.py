@@ -5,11 +5,12 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 from repdib_lightning.callbacks.status_file import read_status
 from repdib_lightning.data.files import whole_file
@@ -109,7 +110,7 @@ class Point:
             was, now = _first_difference(record.arguments, self.arguments)
             raise UserError(
                 f"{self.folder}: was run with other options ({was or 'nothing'} then, {now or 'nothing'} now); remove "
-                "it, or give the suite's new settings another name"
+                f"it and {self.file}, or give the suite's new settings another name"
             )
         return record
 
@@ -143,9 +144,7 @@ class Point:
         """
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         with open(self._lock_file, "w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            if not _take(file):
                 yield None
                 return
             os.set_inheritable(file.fileno(), True)
@@ -182,7 +181,21 @@ def _wanted(setting: Setting, only: tuple[str, ...]) -> bool:
     return not only or any(word in (setting.grid, setting.name, setting.place) for word in only)
 
 
+def _take(file: IO[str]) -> bool:
+    """Take the lock. Tries for a moment, because :meth:`Point.state` of another process holds it for microseconds."""
+    for pause in (0.001, 0.01, 0.05, 0.1, 0.0):
+        with suppress(BlockingIOError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        time.sleep(pause)
+    return False
+
+
 def _first_difference(before: list[str], now: list[str]) -> tuple[str, str]:
+    """The first word that differs on each side, after the option that it belongs to."""
     longest = max(len(before), len(now))
     padded = [words + [""] * (longest - len(words)) for words in (before, now)]
-    return next((a, b) for a, b in zip(*padded, strict=True) if a != b)
+    place = next(i for i, (a, b) in enumerate(zip(*padded, strict=True)) if a != b)
+    option = before[place - 1] if 0 < place <= len(before) and before[place - 1].startswith("--") else ""
+    was, now_is = (f"{option} {words[place]}".strip() if words[place] else "" for words in padded)
+    return was, now_is
