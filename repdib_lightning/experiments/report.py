@@ -21,7 +21,8 @@ from repdib_lightning.experiments.headline import headline, verdicts
 from repdib_lightning.experiments.page import Part, as_markdown, as_section, facts_of
 from repdib_lightning.experiments.results import Results, load_results
 from repdib_lightning.experiments.run import RUNS, chosen_points
-from repdib_lightning.experiments.suite import Grid, read_suite
+from repdib_lightning.experiments.suite import Grid
+from repdib_lightning.experiments.suite_file import read_suite
 
 RESULTS = Path("results")
 

@@ -19,7 +19,8 @@ from repdib_lightning.experiments.attempt import forget
 from repdib_lightning.experiments.executors import Executor, build_executor
 from repdib_lightning.experiments.points import PHASES, Point, State, points_of
 from repdib_lightning.experiments.slurm import jobs_in_queue
-from repdib_lightning.experiments.suite import Suite, check_seeds, read_suite
+from repdib_lightning.experiments.suite import Suite, check_seeds
+from repdib_lightning.experiments.suite_file import read_suite
 from repdib_lightning.verbs import Outcome
 from repdib_lightning.word_lists import words
 

@@ -18,7 +18,7 @@ from killing import command_in_processes
 from repdib_lightning.__main__ import VERBS, main
 from repdib_lightning.configurations import packaged, packaged_suites
 from repdib_lightning.environments.collect import collect_robot_arm
-from repdib_lightning.experiments.suite import read_suite
+from repdib_lightning.experiments.suite_file import read_suite
 
 ROOT = Path(__file__).parents[2]
 SMALL = ["--data.batch_size", "8", "--trainer.max_steps", "3", "--trainer.val_check_interval", "2",

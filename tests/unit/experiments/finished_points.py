@@ -11,7 +11,8 @@ import numpy as np
 from repdib_lightning.evaluation.decoder import Drawings
 from repdib_lightning.evaluation.samples import ProbeSamples
 from repdib_lightning.experiments.points import Point, points_of
-from repdib_lightning.experiments.suite import Suite, read_suite
+from repdib_lightning.experiments.suite import Suite
+from repdib_lightning.experiments.suite_file import read_suite
 
 SUITE = """
 title: A made-up suite

@@ -8,7 +8,8 @@ import yaml
 from repdib_lightning.configurations import packaged_suites, resolve
 from repdib_lightning.errors import UserError
 from repdib_lightning.experiments.points import points_of
-from repdib_lightning.experiments.suite import check_seeds, find_suite, identity, read_suite
+from repdib_lightning.experiments.suite import check_seeds, identity
+from repdib_lightning.experiments.suite_file import find_suite, read_suite
 
 GOOD = """
 base: [robot_arm]

@@ -13,7 +13,7 @@ import pytest
 from repdib_lightning.callbacks.status_file import Status
 from repdib_lightning.errors import UserError
 from repdib_lightning.experiments.points import Record, points_of
-from repdib_lightning.experiments.suite import read_suite
+from repdib_lightning.experiments.suite_file import read_suite
 
 SUITE = """
 base: [robot_arm]

@@ -1,4 +1,4 @@
-"""Reports of made-up points: the numbers in the tables, what is refused, and that nothing is reported twice or mixed."""
+"""Reports of made-up points: the numbers in the tables, what is refused, what is named as missing."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,8 @@ from repdib_lightning.experiments.comparison import differences, direction, summ
 from repdib_lightning.experiments.curves import bands
 from repdib_lightning.experiments.report import report_suite
 from repdib_lightning.experiments.results import load_results
-from repdib_lightning.experiments.suite import Claim, HeadlineRow, read_suite
+from repdib_lightning.experiments.suite import Claim, HeadlineRow
+from repdib_lightning.experiments.suite_file import read_suite
 
 FACTORS = {"cell": "state", "time": "noise"}
 
@@ -85,8 +87,8 @@ def test_which_way_is_better(measure, wanted):
 
 
 def line(results, measure="linear/time", reading="kept", **paper):
-    suite = results.suite.__class__(**{**results.suite.__dict__, "headline": (HeadlineRow("x", measure, paper),)})
-    changed = results.__class__(**{**results.__dict__, "suite": suite})
+    suite = replace(results.suite, headline=(HeadlineRow("x", measure, paper),))
+    changed = replace(results, suite=suite)
     (found,) = [found for found in headlines.headline(changed) if found.reading == reading]
     return found
 
@@ -109,23 +111,23 @@ def test_settings_that_the_paper_hardly_tells_apart_have_no_order(results):
 @pytest.mark.parametrize(
     ("claim", "holds"),
     [
-        (dict(measure="linear/noise/kept", of="ratio", at_most=0.5), True),
-        (dict(measure="linear/noise/kept", of="ratio", at_most=0.1), False),
-        (dict(measure="linear/noise/kept", at_least=0.115, judge="mean"), True),
-        (dict(measure="linear/noise/kept", at_least=0.115, judge="whole"), False),
-        (dict(measure="linear/noise/kept", at_least=0.125, judge="mean"), False),
-        (dict(measure="linear/noise/kept", at_least=0.125, judge="any"), True),
-        (dict(measure="linear/noise/kept", at_most=0.115, judge="any"), True),
-        (dict(measure="linear/noise/kept", at_most=0.05, judge="any"), False),
-        (dict(measure="linear/cell/error", of="difference", at_most=0.0, judge="any"), True),
-        (dict(measure="linear/cell/error", of="ratio", at_most=1.0), None),
-        (dict(measure="linear/noise/kept", than="vq", of="difference", at_most=-0.09, judge="whole"), True),
-        (dict(measure="linear/noise/kept", than="vq", of="difference", at_most=-0.11), False),
+        ({"measure": "linear/noise/kept", "of": "ratio", "at_most": 0.5}, True),
+        ({"measure": "linear/noise/kept", "of": "ratio", "at_most": 0.1}, False),
+        ({"measure": "linear/noise/kept", "at_least": 0.115, "judge": "mean"}, True),
+        ({"measure": "linear/noise/kept", "at_least": 0.115, "judge": "whole"}, False),
+        ({"measure": "linear/noise/kept", "at_least": 0.125, "judge": "mean"}, False),
+        ({"measure": "linear/noise/kept", "at_least": 0.125, "judge": "any"}, True),
+        ({"measure": "linear/noise/kept", "at_most": 0.115, "judge": "any"}, True),
+        ({"measure": "linear/noise/kept", "at_most": 0.05, "judge": "any"}, False),
+        ({"measure": "linear/cell/error", "of": "difference", "at_most": 0.0, "judge": "any"}, True),
+        ({"measure": "linear/cell/error", "of": "ratio", "at_most": 1.0}, None),
+        ({"measure": "linear/noise/kept", "than": "vq", "of": "difference", "at_most": -0.09, "judge": "whole"}, True),
+        ({"measure": "linear/noise/kept", "than": "vq", "of": "difference", "at_most": -0.11}, False),
     ],
 )
 def test_claims_are_held_against_mean_or_interval(results, claim, holds):
-    suite = results.suite.__class__(**{**results.suite.__dict__, "claims": (Claim("x", "repdib", **claim),)})
-    (found,) = headlines.verdicts(results.__class__(**{**results.__dict__, "suite": suite}))
+    suite = replace(results.suite, claims=(Claim("x", "repdib", **claim),))
+    (found,) = headlines.verdicts(replace(results, suite=suite))
     assert found.holds is holds
 
 
@@ -151,7 +153,7 @@ def files(folder):
 
 
 def test_the_report_is_whole_repeatable_and_needs_no_network(tmp_path, monkeypatch):
-    path, suite, runs = made_up(tmp_path, typical)
+    path, _suite, runs = made_up(tmp_path, typical)
     shown = report_suite(path, output=tmp_path / "a", runs=runs)
     report_suite(path, output=tmp_path / "b", runs=runs)
     first = files(tmp_path / "a")
@@ -171,7 +173,7 @@ def test_the_report_is_whole_repeatable_and_needs_no_network(tmp_path, monkeypat
 
 
 def test_what_is_not_finished_is_named_and_left_out(tmp_path):
-    path, suite, runs = made_up(tmp_path, typical)
+    path, _suite, runs = made_up(tmp_path, typical)
     (runs / "made_up/bottleneck/vq/seed_3.json").unlink()
     shown = report_suite(path, output=tmp_path / "a", runs=runs)
     assert "bottleneck/vq seed 3" in shown
@@ -192,7 +194,7 @@ def test_development_seeds_do_not_reach_the_results_by_themselves(tmp_path, monk
 
 
 def test_runs_on_other_data_are_not_compared(tmp_path):
-    path, suite, runs = made_up(tmp_path, typical)
+    path, _suite, runs = made_up(tmp_path, typical)
     file = runs / "made_up/bottleneck/vq/seed_3.json"
     file.write_text(file.read_text().replace('"fingerprint": "abc"', '"fingerprint": "other"'))
     with pytest.raises(UserError, match=r"vq/seed_3: was trained on other data than .*none/seed_0"):
@@ -210,7 +212,7 @@ def test_runs_on_other_data_are_not_compared(tmp_path):
     ],
 )
 def test_measures_that_no_point_has_are_refused_by_name(tmp_path, old, new, said):
-    _, suite, runs = made_up(tmp_path, typical)
+    _, _suite, runs = made_up(tmp_path, typical)
     path = write_suite(tmp_path, **{old: new})
     with pytest.raises(UserError) as caught:
         report_suite(path, output=tmp_path / "a", runs=runs)
@@ -219,7 +221,7 @@ def test_measures_that_no_point_has_are_refused_by_name(tmp_path, old, new, said
 
 
 def test_a_baseline_that_nothing_was_kept_of_gives_no_ratio(tmp_path):
-    path, suite, runs = made_up(tmp_path, lambda s, n: {**typical(s, n), "linear/time/kept": 0.0})
+    path, _suite, runs = made_up(tmp_path, lambda s, n: {**typical(s, n), "linear/time/kept": 0.0})
     report_suite(path, output=tmp_path / "a", runs=runs)
     assert "| time: how much of it is kept | - | - | - | - |" in (tmp_path / "a/report.md").read_text()
 
