@@ -36,6 +36,8 @@ def facts_of(results: Results) -> list[str]:
         "Probes are fitted on some held-out episodes and scored on others. Intervals: 95 %, bootstrap over seeds "
         "(percentile, 10,000 resamples); with five seeds they are somewhat too narrow.",
     ]
+    if len(results.seeds) == 1:
+        facts.append("ONE SEED: nothing here has a spread; read it as an anecdote.")
     if results.missing:
         facts.append(f"NOT FINISHED, and left out: {', '.join(results.missing)}.")
     others = {json.dumps(record.versions) for record in results.records.values()}

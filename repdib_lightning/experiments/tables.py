@@ -94,8 +94,10 @@ def difference_table(results: Results, grid: Grid, found: Sequence[Difference], 
         for name in names:
             cell = cells.get((name, measure))
             row += [NOTHING if cell is None else interval(cell.difference, signed=True)]
-            row += [interval(cell.better, 2) if cell is not None and cell.better is not None else NOTHING]
-        rows.append(row)
+            told = cell is not None and cell.n > 1  # one run above another says nothing of the next
+            row += [interval(cell.better, 2) if cell is not None and told else NOTHING]
+        if set(row[1:]) != {NOTHING}:
+            rows.append(row)
     header = [f"minus {grid.baseline}"]
     for name in names:
         header += [name, f"P({name} better)"]

@@ -139,6 +139,17 @@ def test_one_seed_gives_no_interval_and_no_verdict_on_one(tmp_path):
     assert found.mean.low is None and found.mean.value == pytest.approx(0.8)
 
 
+def test_one_seed_is_called_an_anecdote_and_gives_no_probabilities(tmp_path):
+    path, _, runs = made_up(tmp_path, typical)
+    report_suite(path, output=tmp_path / "a", runs=runs, seeds="3")
+    text = (tmp_path / "a/report.md").read_text()
+    assert "ONE SEED" in text and "NOT FINISHED" not in text
+    (row,) = re.findall(r"\| linear/noise/kept ↓ \| -0.600 (.*)", text)
+    assert row == "| - | -0.700 | - |"
+    report_suite(path, output=tmp_path / "b", runs=runs, seeds="3,4")
+    assert "ONE SEED" not in (tmp_path / "b/report.md").read_text()
+
+
 def test_bands_are_over_seeds_at_the_steps_that_all_logged(results):
     path = results.points["bottleneck/vq", 0].folder / "metrics.csv"
     path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
