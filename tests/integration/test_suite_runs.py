@@ -41,7 +41,9 @@ seeds: [0, 1]
 grids:
   g: {vary: {config: [bottleneck/none, bottleneck/vib]}}
 """
-LAUNCH = """import sys
+LAUNCH = """import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job, or nohup, ignores these two
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 sys.executable = sys.argv.pop(1)
 from repdib_lightning.__main__ import main
 from repdib_lightning.experiments import run
