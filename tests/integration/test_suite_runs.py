@@ -316,7 +316,7 @@ def test_settings_that_share_a_run_are_found_under_either_name(here):
     [
         (["--executor", "slrum"], "--executor: unknown 'slrum': did you mean 'slurm'?"),
         (["--jobs", "0"], "--jobs must be at least 1, is 0"),
-        (["--jobs", "many"], "jobs: "),
+        (["--jobs", "many"], "jobs: expected int, got 'many'"),
         (["--only", "non"], "--only: no setting or grid is called 'non' did you mean 'none'?"),
         (["--only", ","], "--only: expected a word"),
         (["--seeds", "0", "--tune"], "--seeds: seed 0 is for reporting only"),
