@@ -33,8 +33,10 @@ def one_line(error: BaseException, options: Iterable[str], classes: dict[str, li
         return UserError(f"{key}: unknown class '{match[1]}' {nearest(match[1], classes.get(keys[0], []))}")
     if match := re.search(r"Expected an? (?:<class ')?([\w.]+)'?>?\. Got value: (.*)", text):
         return UserError(f"{key}: expected {match[1]}, got '{match[2].split(' Got value')[0].strip().rstrip('.')}'")
-    kinds, given = re.findall(r"- Expected an? <class '(\w+)'>", text), re.search(r"Given value: (.*)", text)
-    if kinds and given:
+    plain = re.search(r"Subtypes: \[((?:<class '(?:int|float|str|bool|NoneType)'>(?:, )?)+)\]", text)
+    given = re.search(r"Given value: (.*)", text)
+    if plain and given:
+        kinds = re.findall(r"'(\w+)'", plain[1])
         wanted = " or ".join(kind for kind in kinds if kind != "NoneType")
         return UserError(f"{key}: expected {wanted}, got '{given[1]}'")
     if match := re.search(r"(?:Errors:\s*|expects a function or a callable class: )-? ?(.+)", text):
