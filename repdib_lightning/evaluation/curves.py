@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from repdib_lightning.errors import UserError
-from repdib_lightning.evaluation.figures import COLOURS, plain_axes, png
+from repdib_lightning.evaluation.figures import COLOURS, panel_grid, plain_axes, png
 
 WORTH_SHOWING = ("loss", "accuracy", "perplexity")
 MOST_PANELS = 6
@@ -57,13 +56,8 @@ def training_curves(files: Mapping[str, Path]) -> bytes | None:
         return None
     ranked = sorted(names, key=lambda name: (-sum(name in curves for curves in runs.values()), len(name), name))
     shown = ranked[:MOST_PANELS]
-    columns = min(3, len(shown))
-    lines = -(-len(shown) // columns)
-    figure = Figure(figsize=(3.6 * columns, 2.5 * lines + 0.5), layout="constrained")
-    panels = figure.subplots(lines, columns, squeeze=False).ravel()
-    for panel in panels[len(shown) :]:
-        panel.set_visible(False)
-    for panel, name in zip(panels, shown, strict=False):
+    figure, panels = panel_grid(len(shown), 3, 3.6, 2.5)
+    for panel, name in zip(panels, shown, strict=True):
         for i, (run, curves) in enumerate(runs.items()):
             points = curves.get(name, np.empty((0, 2)))
             panel.plot(*points.T, color=COLOURS[i % len(COLOURS)], label=run, linewidth=1.3)

@@ -3,7 +3,7 @@
 The paper reconstructs the robot's image from the frozen representation ("visual noise") and names neither decoder nor
 error. Here the decoder is kernel ridge regression from the latent to all pixels, fitted on one half of the held-out
 episodes and scored on the other. It is solved in closed form, so that no budget of training steps decides what counts
-as kept; on a few thousand frames it draws better than a network of transposed convolutions does.
+as kept.
 
 The error of a region is the squared error of its pixels over that of the best picture that ignores the latent: of the
 mean picture for the agent's pixels, and of the mean background (each pixel's mean over the frames where the agent does

@@ -30,6 +30,17 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
+def panel_grid(count: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure of ``count`` panels of this size in inches, at most ``columns`` side by side."""
+    columns = min(columns, count)
+    lines = -(-count // columns)
+    figure = Figure(figsize=(width * columns, height * lines + 0.5), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False).ravel().tolist()
+    for panel in panels[count:]:
+        panel.set_visible(False)
+    return figure, panels[:count]
+
+
 def kept_bars(reports: Mapping[str, ProbeReport]) -> bytes:
     """Bars of *kept* for each factor, the runs side by side, state apart from noise.
 

@@ -178,9 +178,7 @@ def probe_bundle(
     check_output_file(target, "--output", ".json", [Path(data), *protected_files(folder)])
     if samples is not None:
         check_output_file(Path(samples), "--samples", ".npz", [Path(data)])
-    store = open_for_probing(data)
-    if DECODER in chosen:
-        check_pictures(store)
+    store = open_for_probing(data, chosen)
     check_compatible(encoder, store, str(folder))
     encoded = encode_evaluation(encoder, store, device=encoder.device, progress=progress)
     name = display_name(folder)
@@ -219,13 +217,16 @@ def load_for_probing(bundle: Path, device: str) -> FrozenEncoder:
     return load_encoder(bundle).to(resolve_device(device))
 
 
-def open_for_probing(data: Path) -> EpisodeStore:
+def open_for_probing(data: Path, probes: Sequence[str] = PROBES) -> EpisodeStore:
     """Open a store and check that it can be probed.
 
     Raises:
-        UserError: it cannot be read, has no factors, NaN in one, or too few evaluation episodes.
+        UserError: it cannot be read, has no factors, NaN in one, too few evaluation episodes, or (for ``decoder``) no
+            pictures.
     """
     store = EpisodeStore(data)
+    if DECODER in probes:
+        check_pictures(store)
     split_evaluation(store)
     if not store.factors:
         raise UserError(f"{data}: has no 'factors' to probe for (keys: observations, ...); nothing to measure")

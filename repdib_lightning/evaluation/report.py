@@ -105,7 +105,7 @@ def compare(
     encoders = {name: load_for_probing(Path(bundle), device) for name, bundle in bundles.items()}
     for path in metrics.values():
         curves.read_curves(path)
-    store = open_for_probing(data)
+    store = open_for_probing(data, chosen)
     for name, encoder in encoders.items():
         check_compatible(encoder, store, str(bundles[name]))
     runs = {}

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from repdib_lightning.evaluation.embedding import tsne
-from repdib_lightning.evaluation.figures import COLOURS, number_classes, plain_axes, png
+from repdib_lightning.evaluation.figures import COLOURS, number_classes, panel_grid, plain_axes, png
 from repdib_lightning.evaluation.samples import ProbeSamples
 from repdib_lightning.experiments import statistics
 from repdib_lightning.experiments.comparison import direction
@@ -23,13 +23,8 @@ HINTS = {"up": " (high is good)", "down": " (low is good)", "": ""}
 
 def seed_points(results: Results, grid: Grid, measures: Sequence[str]) -> bytes:
     """One panel a measure: every seed a dot, the mean a bar across them with its 95 % interval."""
-    columns = min(COLUMNS, len(measures))
-    lines = -(-len(measures) // columns)
-    figure = Figure(figsize=(3.1 * columns, 2.5 * lines + 0.4), layout="constrained")
-    panels = figure.subplots(lines, columns, squeeze=False).ravel()
-    for panel in panels[len(measures) :]:
-        panel.set_visible(False)
-    for panel, measure in zip(panels, measures, strict=False):
+    figure, panels = panel_grid(len(measures), COLUMNS, 3.1, 2.5)
+    for panel, measure in zip(panels, measures, strict=True):
         for place, setting in enumerate(grid.settings):
             values = np.array(list(results.values(setting, measure).values()))
             if len(values):

@@ -170,15 +170,12 @@ def points_of(suite: Suite, seeds: Iterable[int], root: Path, only: Iterable[str
 
     Args:
         suite: the suite. seeds: to use. root: folder of all suites' runs.
-        only: ``grid``, ``grid/setting`` or ``setting``; everything by default.
+        only: places (``grid/setting``) of the settings to take; all by default.
     """
-    chosen = [setting for setting in suite.settings if _wanted(setting, tuple(only))]
+    wanted = set(only)
+    chosen = [setting for setting in suite.settings if not wanted or setting.place in wanted]
     place = root / suite.name
     return [Point(suite, setting, seed, place / setting.place / f"seed_{seed}") for seed in seeds for setting in chosen]
-
-
-def _wanted(setting: Setting, only: tuple[str, ...]) -> bool:
-    return not only or any(word in (setting.grid, setting.name, setting.place) for word in only)
 
 
 def _take(file: IO[str]) -> bool:

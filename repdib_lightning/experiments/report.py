@@ -15,7 +15,7 @@ from repdib_lightning.evaluation.report import Section, write_report
 from repdib_lightning.evaluation.samples import ProbeSamples, read_samples
 from repdib_lightning.experiments import figures, tables
 from repdib_lightning.experiments.attempt import PROBE_FILE, SAMPLES_FILE
-from repdib_lightning.experiments.comparison import differences, summaries
+from repdib_lightning.experiments.comparison import Difference, Summary, differences, summaries
 from repdib_lightning.experiments.curves import Band, bands, write_bands
 from repdib_lightning.experiments.headline import headline, verdicts
 from repdib_lightning.experiments.page import Part, as_markdown, as_section, facts_of
@@ -25,6 +25,8 @@ from repdib_lightning.experiments.suite import Grid
 from repdib_lightning.experiments.suite_file import read_suite
 
 RESULTS = Path("results")
+Numbers = dict[str, tuple[list[Summary], list[Difference]]]
+"""Grid -> all its summaries and differences."""
 
 
 def report_suite(
@@ -48,8 +50,11 @@ def report_suite(
     folder = output or (runs / plan.name / "report" if tune else RESULTS / plan.name)
     check_output_file(folder / "report.html", "--output", ".html")
     all_bands = {grid.name: bands(results, grid) for grid in plan.grids}
-    parts = [*_headline_part(results), *_grid_parts(results, all_bands), *_latent_parts(results)]
+    found = {grid.name: (summaries(results, grid), differences(results, grid)) for grid in plan.grids}
+    parts = [*_headline_part(results), *_grid_parts(results, found, all_bands), *_latent_parts(results)]
     _write(folder, results, parts, all_bands)
+    tables.write_summaries(folder / "summary.csv", [row for rows, _ in found.values() for row in rows])
+    tables.write_differences(folder / "differences.csv", [row for _, rows in found.values() for row in rows])
     missing = f"    {len(results.missing)} not finished: {', '.join(results.missing[:4])}" if results.missing else ""
     shown = "\n\n".join(table.text() for table in parts[0].tables)
     return f"{shown}\n\nwrote {folder}/report.md, report.html and the rest, of {len(results.records)} points{missing}"
@@ -71,16 +76,18 @@ def _headline_part(results: Results) -> list[Part]:
         "high where noise was dropped; and how much of it is kept, (score - chance) / (1 - chance), then low.",
         "Paper's order: whether any two settings that the paper tells apart, by 0.01 or more, come in the same order.",
     ]
+    if not lines:
+        return [Part("Claims", [], shown, {})]
     return [Part("The paper's table, and ours", sentences, shown, {})]
 
 
-def _grid_parts(results: Results, all_bands: dict[str, dict[str, dict[str, Band]]]) -> list[Part]:
+def _grid_parts(results: Results, found: Numbers, all_bands: dict[str, dict[str, dict[str, Band]]]) -> list[Part]:
     parts = []
     for grid in results.suite.grids:
         measures = table_measures(results, grid)
         shown = [
-            tables.summary_table(results, grid, summaries(results, grid), measures),
-            tables.difference_table(results, grid, differences(results, grid), measures),
+            tables.summary_table(results, grid, found[grid.name][0], measures),
+            tables.difference_table(results, grid, found[grid.name][1], measures),
         ]
         drawn = {f"{grid.name}-seeds": figures.seed_points(results, grid, _drawn_measures(measures))}
         drawn |= _known(f"{grid.name}-curves", figures.curves_with_bands(grid, all_bands[grid.name]))
@@ -146,11 +153,8 @@ def _latent_parts(results: Results) -> list[Part]:
     drawings = {name: part.drawings for name, part in samples.items() if part.drawings is not None}
     drawn = {"latents": figures.latent_maps(samples, colours)} if colours else {}
     drawn |= {"drawn": probe_figures.drawn_strip(drawings)} if drawings else {}
-    return (
-        [Part(f"What the latents look like (seed {shared[0]})", ["t-SNE of held-out latents."], [], drawn)]
-        if drawn
-        else []
-    )
+    title = f"What the latents look like (seed {shared[0]})"
+    return [Part(title, ["t-SNE of held-out latents."], [], drawn)] if drawn else []
 
 
 def _known(name: str, content: bytes | None) -> dict[str, bytes]:
@@ -163,8 +167,6 @@ def _write(
     suite = results.suite
     lines = [results.records[key].line() for key in results.records]
     _write_text(folder / "points.jsonl", "\n".join(lines) + "\n")
-    tables.write_summaries(folder / "summary.csv", [row for grid in suite.grids for row in summaries(results, grid)])
-    tables.write_differences(folder / "differences.csv", [row for g in suite.grids for row in differences(results, g)])
     write_bands(folder / "curves.csv", all_bands)
     for part in parts:
         for name, content in part.figures.items():

@@ -8,6 +8,7 @@ from repdib_lightning.data.writer import EpisodeWriter
 from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation import decoder
 from repdib_lightning.evaluation.decoder import SHOWN, check_pictures, measure_pictures
+from repdib_lightning.evaluation.probe import open_for_probing
 from repdib_lightning.evaluation.probes import Standardiser
 from repdib_lightning.evaluation.splits import episode_folds
 from repdib_lightning.records import ArraySpec
@@ -240,5 +241,5 @@ def test_a_store_without_pictures_is_refused_in_one_line(store, tmp_path):
         for _ in range(2):
             writer.add_episode(observations={"sensor": np.zeros((2, 3), np.float32)})
     with pytest.raises(UserError, match=r"numbers\.h5: has no pictures.*leave 'decoder' out of probes") as error:
-        check_pictures(EpisodeStore(tmp_path / "numbers.h5"))
+        open_for_probing(tmp_path / "numbers.h5", ("linear", "decoder"))
     assert "\n" not in str(error.value)

@@ -51,7 +51,7 @@ def test_the_packaged_suite_of_the_robot_arm():
     assert len(points) == 35 and len({point.folder for point in points}) == 35
     assert [point.seed for point in points[:8]] == [0] * 7 + [1]  # a whole table first
     assert points[0].folder == Path("runs/robot_arm/bottleneck/none/seed_0")
-    assert points_of(suite, [3], Path("runs"), ["vq"])[0].name == "bottleneck/vq seed 3"
+    assert points_of(suite, [3], Path("runs"), ["bottleneck/vq"])[0].name == "bottleneck/vq seed 3"
 
 
 @pytest.mark.parametrize("name", sorted(packaged_suites()))

@@ -28,7 +28,7 @@ grids:
 def make_point(folder, shift=2, seed=0, more=""):
     path = folder / "mine.yaml"
     path.write_text(SUITE.replace("SHIFT", str(shift)).replace("vary:", f"{more}vary:"))
-    return points_of(read_suite(path), [seed], folder / "runs", ["none"])[0]
+    return points_of(read_suite(path), [seed], folder / "runs", ["g/none"])[0]
 
 
 @pytest.fixture

@@ -231,6 +231,16 @@ def test_measures_that_no_point_has_are_refused_by_name(tmp_path, old, new, said
     assert not (tmp_path / "a").exists()
 
 
+def test_claims_without_a_papers_table_stand_alone(tmp_path):
+    claims = "claims: {less noise: {setting: vq, measure: linear/noise/kept, of: ratio, at_most: 0.5}}"
+    paper = "  time:\n    measure: linear/time\n    paper: {none: 1.0, vq: 0.70, repdib: 0.66}\n"
+    _, _, runs = made_up(tmp_path, typical)
+    path = write_suite(tmp_path, **{"claims: {}": claims, f"headline:\n{paper}": ""})
+    report_suite(path, output=tmp_path / "a", runs=runs)
+    text = (tmp_path / "a/report.md").read_text()
+    assert "## Claims" in text and "| less noise |" in text and "paper" not in text.lower()
+
+
 def test_a_baseline_that_nothing_was_kept_of_gives_no_ratio(tmp_path):
     path, _suite, runs = made_up(tmp_path, lambda s, n: {**typical(s, n), "linear/time/kept": 0.0})
     report_suite(path, output=tmp_path / "a", runs=runs)
