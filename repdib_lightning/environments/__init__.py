@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-COLLECTORS = {"robot_arm": "repdib_lightning.environments.collect:collect_robot_arm"}
+COLLECTORS = {
+    "maze": "repdib_lightning.environments.collect_maze:collect_maze",
+    "robot_arm": "repdib_lightning.environments.collect:collect_robot_arm",
+}
 """Environment -> ``module:function`` that records a data set of it: ``function(path, *, seed, overwrite, ...)``."""
 
-GYMNASIUM_IDS = {"repdib/RobotArm-v0": "repdib_lightning.environments.robot_arm_env:RobotArmEnv"}
+_MAZES = ("GridWorld", "SpiralWorld", "LoopWorld")
+
+GYMNASIUM_IDS = {
+    **{f"repdib/{world}-v0": "repdib_lightning.environments.maze_env:MazeEnv" for world in _MAZES},
+    "repdib/RobotArm-v0": "repdib_lightning.environments.robot_arm_env:RobotArmEnv",
+}
 """Identifier for ``gymnasium.make`` -> class; see :func:`register`."""
+
+_VECTORISED = {
+    f"repdib/{world}-v0": "repdib_lightning.environments.maze_vector_env:MazeVectorEnv" for world in _MAZES
+}
 
 
 def register() -> None:
@@ -18,4 +30,8 @@ def register() -> None:
 
     for name, entry_point in GYMNASIUM_IDS.items():
         if name not in gymnasium.registry:
-            gymnasium.register(name, entry_point=entry_point)
+            world = name.removeprefix("repdib/").removesuffix("-v0")
+            chosen = {"world": world} if world in _MAZES else {}
+            gymnasium.register(
+                name, entry_point=entry_point, vector_entry_point=_VECTORISED.get(name), kwargs=chosen
+            )
