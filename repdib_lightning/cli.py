@@ -29,6 +29,7 @@ from repdib_lightning.callbacks.codebook_use import CodebookUse
 from repdib_lightning.callbacks.metrics_csv import MetricsCSV
 from repdib_lightning.callbacks.pictures import Pictures
 from repdib_lightning.data.datamodule import EpisodeDataModule
+from repdib_lightning.data.mazes import MazeDataModule
 from repdib_lightning.data.robot_arm import RobotArmDataModule
 from repdib_lightning.encoders import ENCODERS
 from repdib_lightning.errors import UserError
@@ -44,7 +45,7 @@ SLOTS: dict[str, list[str]] = {
     "model.bottleneck": list(BOTTLENECKS),
     "model.objective": list(OBJECTIVES),
     "model.optimizer": [name for name, item in vars(torch.optim).items() if isinstance(item, type)],
-    "data": [EpisodeDataModule.__name__, RobotArmDataModule.__name__],
+    "data": [EpisodeDataModule.__name__, MazeDataModule.__name__, RobotArmDataModule.__name__],
 }
 """Key of a slot in the configuration -> names of the classes that fit it."""
 

@@ -16,9 +16,7 @@ GYMNASIUM_IDS = {
 }
 """Identifier for ``gymnasium.make`` -> class; see :func:`register`."""
 
-_VECTORISED = {
-    f"repdib/{world}-v0": "repdib_lightning.environments.maze_vector_env:MazeVectorEnv" for world in _MAZES
-}
+_VECTORISED = {f"repdib/{world}-v0": "repdib_lightning.environments.maze_vector_env:MazeVectorEnv" for world in _MAZES}
 
 
 def register() -> None:
@@ -32,6 +30,4 @@ def register() -> None:
         if name not in gymnasium.registry:
             world = name.removeprefix("repdib/").removesuffix("-v0")
             chosen = {"world": world} if world in _MAZES else {}
-            gymnasium.register(
-                name, entry_point=entry_point, vector_entry_point=_VECTORISED.get(name), kwargs=chosen
-            )
+            gymnasium.register(name, entry_point=entry_point, vector_entry_point=_VECTORISED.get(name), kwargs=chosen)

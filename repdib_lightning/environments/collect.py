@@ -68,13 +68,18 @@ class RobotArmRecording:
         return min(self.episode_length, self.samples - episode * self.episode_length)
 
     def evaluation_episodes(self) -> set[int]:
-        """Which episodes are never trained on: about 30 %, spread evenly.
+        """Which episodes are never trained on; see :func:`evaluation_episodes`."""
+        return evaluation_episodes(self.episodes)
 
-        Of few episodes up to half, so that there are 4 where possible: probes are fitted on half of them and scored on
-        the other half.
-        """
-        count = max(min(4, self.episodes // 2), round(EVALUATION_SHARE * self.episodes)) if self.episodes > 1 else 0
-        return {int((i + 0.5) * self.episodes / count) for i in range(count)}
+
+def evaluation_episodes(episodes: int) -> set[int]:
+    """Which of the episodes of a recording are never trained on: about 30 %, spread evenly.
+
+    Of few episodes up to half, so that there are 4 where possible: probes are fitted on half of them and scored on the
+    other half.
+    """
+    count = max(min(4, episodes // 2), round(EVALUATION_SHARE * episodes)) if episodes > 1 else 0
+    return {int((i + 0.5) * episodes / count) for i in range(count)}
 
 
 def collect_robot_arm(

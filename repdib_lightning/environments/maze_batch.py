@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from repdib_lightning.environments.distractors import Distractors
 from repdib_lightning.environments.maze_pictures import MazePainter
-from repdib_lightning.environments.mazes import Maze, build_maze
-from repdib_lightning.errors import UserError
+from repdib_lightning.environments.mazes import MOVES, Maze, build_maze
+from repdib_lightning.environments.numbered_clips import NumberedClips
+from repdib_lightning.errors import UserError, nearest
 
 NO_GOAL = -1
+SMALLEST_CELL, LARGEST_CELL = 3, 64
 CellName = str | Sequence[int]
 """A cell as users name it: ``centre``, ``"row,column"`` or (row, column)."""
 
@@ -24,6 +26,7 @@ class MazeBatch:
 
     Attributes:
         maze: the world. painter: draws it. goal_cells: (g,) cells that an episode's goal is drawn from.
+        start: the cell where episodes begin, or None: any.
         cells, goals, steps: (n,) int64, the state of each maze; goals are -1 without a goal.
     """
 
@@ -42,33 +45,91 @@ class MazeBatch:
         distractors: str | None = None,
         distractor_seed: int = 0,
     ) -> None:
-        for name, value, least in (("cell_pixels", cell_pixels, 3), ("episode_length", episode_length, 1)):
-            if value < least:
-                raise UserError(f"{name}={value}: must be at least {least}")
+        for name, value in (("num_envs", count), ("episode_length", episode_length)):
+            if value < 1:
+                raise UserError(f"{name}={value}: must be at least 1")
+        if not SMALLEST_CELL <= cell_pixels <= LARGEST_CELL:
+            raise UserError(f"cell_pixels={cell_pixels}: must be from {SMALLEST_CELL} to {LARGEST_CELL}")
         self.maze = build_maze(world, size)
         self.goal_cells = np.array(_goals(self.maze, goals, evaluation), np.int64)
-        self.start = None if start == "random" else cell_of(self.maze, start, "start")
+        self.start = None if isinstance(start, str) and start == "random" else cell_of(self.maze, start, "start")
         if self.start is not None and self.start in self.goal_cells:
             raise UserError(f"start={start}: is also a goal, so that an episode would end before it begins")
         self.episode_length = episode_length
         self.painter = MazePainter(self.maze, cell_pixels, show_walls)
-        self._clips: Distractors | None = None
+        self._clips: NumberedClips | None = None
         if distractors is not None:
-            split = "evaluation" if evaluation else "train"
-            pixels = self.painter.pixels
-            self._clips = Distractors.from_spec(distractors, split, seed=distractor_seed, size=pixels)
+            self._clips = NumberedClips(distractors, distractor_seed, size=self.painter.pixels)
+            self._clip_numbers = self._clips.numbers(evaluation)
         self.cells, self.goals, self.steps, self._clip, self._frame = np.zeros((5, count), np.int64)
 
-    def reset(self, which: np.ndarray, random: np.random.Generator) -> None:
-        """Begin episodes: draw goal, start (never on the goal) and background of the mazes in the mask (n,)."""
-        for index in np.flatnonzero(which):
-            goal = int(random.choice(self.goal_cells)) if len(self.goal_cells) else NO_GOAL
-            start = int(random.integers(self.maze.cells - (goal != NO_GOAL)))
-            start += int(goal != NO_GOAL and start >= goal)
-            self.place(index, start if self.start is None else self.start, goal)
-            if self._clips is not None:
-                self._clip[index] = random.integers(len(self._clips))
-                self._frame[index] = random.integers(len(self._clips.clip(int(self._clip[index]))))
+    def reset(
+        self,
+        which: np.ndarray,
+        random: np.random.Generator,
+        starts: np.ndarray | None = None,
+        goals: np.ndarray | None = None,
+    ) -> None:
+        """Begin episodes of the mazes in the mask: draw goal, start (never on the goal) and background.
+
+        Args:
+            which: (n,) bool.
+            random: what draws.
+            starts, goals: (n,) cells instead of drawn ones; see :meth:`chosen`.
+
+        Raises:
+            UserError: a start lies on its goal.
+        """
+        index = np.flatnonzero(which)
+        start = None if self.start is None else np.full(len(index), self.start)
+        start = start if starts is None else starts[index]
+        goal = self._drawn_goals(start, len(index), random) if goals is None else goals[index]
+        start = self._drawn_starts(goal, random) if start is None else start
+        for cell in start[start == goal][:1]:
+            raise UserError(f"start={self._named(cell)}: is also the goal; an episode would end before it begins")
+        self.cells[index], self.goals[index], self.steps[index] = start, goal, 0
+        if self._clips is not None:
+            clips = random.choice(self._clip_numbers, len(index))
+            self._clip[index] = clips
+            self._frame[index] = random.integers([len(self._clips.clip(int(clip))) for clip in clips])
+
+    def _drawn_goals(self, starts: np.ndarray | None, count: int, random: np.random.Generator) -> np.ndarray:
+        """(k,) goals, apart from the starts (k,) where these are fixed already."""
+        if not len(self.goal_cells):
+            return np.full(count, NO_GOAL)
+        goals = random.choice(self.goal_cells, count)
+        while starts is not None and len(self.goal_cells) > 1 and (goals == starts).any():
+            goals = np.where(goals == starts, random.choice(self.goal_cells, count), goals)
+        return goals
+
+    def _drawn_starts(self, goals: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        has_goal = goals != NO_GOAL
+        starts = random.integers(self.maze.cells - has_goal)
+        return starts + (has_goal & (starts >= goals))
+
+    def _named(self, cell: int) -> str:
+        return "{},{}".format(*self.maze.place(cell))
+
+    def chosen(self, options: Mapping[str, Any] | None) -> dict[str, np.ndarray]:
+        """What ``reset(options=...)`` of the environments means, as arguments of :meth:`reset`.
+
+        Args:
+            options: ``start`` and ``goal``, each one cell as users name them, or a sequence of n cells.
+
+        Raises:
+            UserError: another option, a cell outside the maze, or neither 1 nor n cells.
+        """
+        known = {"start": "starts", "goal": "goals"}
+        found = {}
+        for name, value in (options or {}).items():
+            if name not in known:
+                raise UserError(f"reset: unknown option '{name}' {nearest(name, known)}")
+            cells = [value] if _is_one_cell(value) else list(value)
+            if len(cells) not in (1, len(self.cells)):
+                raise UserError(f"{name}: names {len(cells)} cells for {len(self.cells)} mazes; give one, or one each")
+            numbers = np.array([cell_of(self.maze, cell, name) for cell in cells], np.int64)
+            found[known[name]] = np.broadcast_to(numbers, len(self.cells))
+        return found
 
     def place(self, index: int, cell: int, goal: int) -> None:
         """Begin an episode of one maze at a chosen cell with a chosen goal (-1: none)."""
@@ -77,9 +138,17 @@ class MazeBatch:
     def move(self, actions: np.ndarray, which: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Move the mazes in the mask (all by default).
 
+        Args:
+            actions: (n,) integers in [0, 4); those outside the mask do nothing.
+            which: (n,) bool.
+
         Returns:
             rewards (n,) float64, reached (n,) bool, truncated (n,) bool; 0 and False outside the mask.
+
+        Raises:
+            UserError: actions of another shape, type or range.
         """
+        actions = self._valid(actions)
         moving = np.ones(len(self.cells), bool) if which is None else which
         self.cells = np.where(moving, self.maze.neighbours[self.cells, actions], self.cells)
         self.steps += moving
@@ -88,6 +157,15 @@ class MazeBatch:
         reached = moving & (self.cells == self.goals)
         rewards = -1.0 * (moving & ~reached)
         return rewards, reached, moving & (self.steps >= self.episode_length)
+
+    def _valid(self, actions: np.ndarray) -> np.ndarray:
+        given = np.asarray(actions)
+        if given.shape != self.cells.shape or given.dtype.kind not in "iu":
+            expected = f"integers of shape ({len(self.cells)},)"
+            raise UserError(f"actions: expected {expected}, got {given.dtype} of shape {given.shape}")
+        for wrong in given[(given < 0) | (given >= len(MOVES))][:1]:
+            raise UserError(f"action {wrong}: must be from 0 to {len(MOVES) - 1} ({', '.join(MOVES)})")
+        return given
 
     def pictures(self) -> np.ndarray:
         """(n, 3, H, W) uint8."""
@@ -101,9 +179,9 @@ class MazeBatch:
         return np.stack([clip[frame % len(clip)] for clip, frame in zip(clips, self._frame, strict=True)])
 
     def factors(self) -> dict[str, np.ndarray]:
-        """Ground truth of the pictures: name -> (n,) int64."""
+        """Ground truth of the pictures: name -> (n,) int64; ``clip`` numbers the training clips before the others."""
         found = {"position": self.cells.copy()}
-        if len(self.goal_cells):
+        if len(self.goal_cells) or (self.goals != NO_GOAL).any():
             found["goal"] = self.goals.copy()
         if self._clips is not None:
             found["clip"] = self._clip.copy()
@@ -111,7 +189,7 @@ class MazeBatch:
 
     @property
     def clip_count(self) -> int:
-        """How many backgrounds there are; 0 for a plain floor."""
+        """How many backgrounds there are in both splits; 0 for a plain floor."""
         return 0 if self._clips is None else len(self._clips)
 
 
@@ -127,15 +205,15 @@ def cell_of(maze: Maze, name: Any, option: str) -> int:
     Raises:
         UserError: naming the option and the nearest cell: not a cell, or one outside the maze or between two cells.
     """
-    if name == "centre":
+    if isinstance(name, str) and name == "centre":
         return maze.centre
     try:
         row, column = (float(part) for part in (name.split(",") if isinstance(name, str) else name))
     except (TypeError, ValueError) as error:
-        raise UserError(f"{option}={name!r:.40}: expected row,column such as 3,2, or centre") from error
-    near = tuple(int(min(max(round(part), 0), maze.size - 1)) if part == part else 0 for part in (row, column))
+        raise UserError(f"{option}={name!s:.40}: expected row,column such as 3,2, or centre") from error
+    near = tuple(round(min(max(part, 0.0), maze.size - 1.0)) if part == part else 0 for part in (row, column))
     if near != (row, column):
-        where = "outside" if not maze.has((row, column)) else "in a wall between the cells"
+        where = "in a wall between the cells" if maze.has((row, column)) else "outside"
         raise UserError(
             f"{option}={row:g},{column:g}: lies {where} of {maze.name}, whose cells go from 0,0 to {maze.size - 1},"
             f"{maze.size - 1}; the nearest is {near[0]},{near[1]}"
@@ -146,9 +224,19 @@ def cell_of(maze: Maze, name: Any, option: str) -> int:
 def _goals(maze: Maze, given: Any, evaluation: bool) -> list[int]:
     if given is None:
         return [maze.centre] if evaluation else training_goals(maze)
+    if not isinstance(given, Iterable):
+        raise UserError(f"goals={given}: expected cells such as '3,2 0,5', or none for a maze without a goal")
     named = given.split() if isinstance(given, str) else list(given)
-    if named == ["none"]:
+    if len(named) == 1 and isinstance(named[0], str) and named[0] == "none":
         return []
     if not named:
         raise UserError("goals: names no cell; expected cells such as '3,2 0,5', or none for a maze without a goal")
     return list(dict.fromkeys(cell_of(maze, cell, "goals") for cell in named))
+
+
+def _is_one_cell(value: Any) -> bool:
+    """Whether this is a name or (row, column), not a sequence of these."""
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        return True
+    parts = list(value)
+    return bool(parts) and all(isinstance(part, Real) for part in parts)

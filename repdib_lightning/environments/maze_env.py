@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from repdib_lightning.environments.maze_batch import NO_GOAL, CellName, MazeBatch, cell_of
+from repdib_lightning.environments.maze_batch import NO_GOAL, CellName, MazeBatch
 from repdib_lightning.environments.maze_pictures import draw_for_people
 from repdib_lightning.environments.mazes import MOVES
 from repdib_lightning.errors import UserError
@@ -20,7 +20,7 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.integer]):
     Observation: (3, H, W) uint8: the agent as a red square, the goal as a green one. Actions: 0 up, 1 down, 2 left,
     3 right; a move into a wall stays. Reward: -1.0 a step, 0.0 on the step that reaches the goal and ends the episode.
     Without a goal every step costs -1.0, which tells nothing of where to go. ``info["factors"]``: ``position`` and
-    ``goal`` as cell numbers (row * size + column), ``clip`` of the background.
+    ``goal`` as cell numbers (row * size + column), ``clip``: number of the background, training ones first.
 
     The paper leaves goal encoding, picture size, episode length, starts and the set of training goals open.
 
@@ -88,27 +88,21 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.integer]):
         """Start an episode; ``options={"start": cell, "goal": cell}`` choose, each as the arguments name cells.
 
         Raises:
-            UserError: a cell outside the maze, or a start on the goal.
+            UserError: another option, a cell outside the maze, or a start on the goal.
         """
         super().reset(seed=seed)
-        self.batch.reset(np.ones(1, bool), self.np_random)
-        chosen = options or {}
-        if chosen:
-            start, goal = int(self.batch.cells[0]), int(self.batch.goals[0])
-            goal = cell_of(self.maze, chosen["goal"], "goal") if "goal" in chosen else goal
-            start = cell_of(self.maze, chosen["start"], "start") if "start" in chosen else start
-            if start == goal and "start" in chosen:
-                raise UserError(f"start={chosen['start']}: is also the goal")
-            while start == goal:
-                start = int(self.np_random.integers(self.maze.cells))
-            self.batch.place(0, start, goal)
+        self.batch.reset(np.ones(1, bool), self.np_random, **self.batch.chosen(options))
         self._running = True
         return self.batch.pictures()[0], self._info()
 
     def step(self, action: np.integer) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Move."""
+        """Move.
+
+        Raises:
+            UserError: the action does not exist.
+        """
         assert self._running, "the episode has ended, call reset()"
-        rewards, reached, truncated = self.batch.move(np.array([int(action)]))
+        rewards, reached, truncated = self.batch.move(np.array([action]))
         self._running = not (reached[0] or truncated[0])
         return self.batch.pictures()[0], float(rewards[0]), bool(reached[0]), bool(truncated[0]), self._info()
 

@@ -30,9 +30,8 @@ class MazePainter:
     def __init__(self, maze: Maze, cell_pixels: int = 5, show_walls: bool = False) -> None:
         self.maze, self.cell_pixels = maze, cell_pixels
         self.pixels = maze.size * cell_pixels
-        self._agents = np.stack([self._square(cell, 1) for cell in range(maze.cells)])
-        self._goals = np.stack([self._square(cell, 0) for cell in range(maze.cells)])
-        self._walls = self._wall_pixels() if show_walls else np.zeros((self.pixels, self.pixels), bool)
+        self._agents, self._goals = self._squares(1), self._squares(0)
+        self._walls = np.flatnonzero(self._wall_pixels()) if show_walls else np.empty(0, np.int64)
 
     def draw(self, agents: np.ndarray, goals: np.ndarray, backgrounds: np.ndarray | None = None) -> np.ndarray:
         """Draw n pictures.
@@ -46,24 +45,30 @@ class MazePainter:
             (n, 3, H, W) uint8.
         """
         count = len(agents)
-        pictures = np.empty((count, self.pixels, self.pixels, 3), np.uint8)
-        pictures[:] = FLOOR if backgrounds is None else backgrounds
-        pictures[:, self._walls] = WALL
+        if backgrounds is None:
+            pictures = np.empty((count, 3, self.pixels**2), np.uint8)
+            pictures[:] = np.array(FLOOR, np.uint8)[:, None]
+        else:
+            pictures = backgrounds.reshape(count, -1, 3).transpose(0, 2, 1).copy()
+        pictures[:, :, self._walls] = np.array(WALL, np.uint8)[:, None]
         seen = np.flatnonzero(goals >= 0)
-        self._fill(pictures, seen, self._goals[goals[seen]], GOAL)
-        self._fill(pictures, np.arange(count), self._agents[agents], AGENT)
-        return np.ascontiguousarray(pictures.transpose(0, 3, 1, 2))
+        _fill(pictures, seen, self._goals[goals[seen]], GOAL)
+        _fill(pictures, np.arange(count), self._agents[agents], AGENT)
+        return pictures.reshape(count, 3, self.pixels, self.pixels)
 
-    @staticmethod
-    def _fill(pictures: np.ndarray, which: np.ndarray, masks: np.ndarray, colour: tuple[int, int, int]) -> None:
-        index, rows, columns = np.nonzero(masks)
-        pictures[which[index], rows, columns] = colour
+    def agent_masks(self, agents: np.ndarray) -> np.ndarray:
+        """(n,) cells -> (n, H, W) bool: where the agent is drawn."""
+        masks = np.zeros((len(agents), self.pixels**2), bool)
+        masks[np.arange(len(agents))[:, None], self._agents[agents]] = True
+        return masks.reshape(-1, self.pixels, self.pixels)
 
-    def _square(self, cell: int, inset: int) -> np.ndarray:
-        row, column = (part * self.cell_pixels for part in self.maze.place(cell))
-        mask = np.zeros((self.pixels, self.pixels), bool)
-        mask[row + inset : row + self.cell_pixels - inset, column + inset : column + self.cell_pixels - inset] = True
-        return mask
+    def _squares(self, inset: int) -> np.ndarray:
+        """(cells, p) int64: for each cell the pixels, numbered row by row, of a square in its middle."""
+        side = np.arange(inset, self.cell_pixels - inset)
+        rows, columns = np.divmod(np.arange(self.maze.cells), self.maze.size)
+        down = rows[:, None] * self.cell_pixels + side
+        right = columns[:, None] * self.cell_pixels + side
+        return (down[:, :, None] * self.pixels + right[:, None, :]).reshape(self.maze.cells, -1)
 
     def _wall_pixels(self) -> np.ndarray:
         mask = np.zeros((self.pixels, self.pixels), bool)
@@ -84,7 +89,15 @@ class MazePainter:
         return self.maze.has((row + step[0], column + step[1]))
 
 
-def draw_for_people(maze: Maze, agent: int | None, goal: int | None, background: np.ndarray | None = None) -> Image.Image:
+def _fill(pictures: np.ndarray, which: np.ndarray, pixels: np.ndarray, colour: tuple[int, int, int]) -> None:
+    """Colour the pixels (k, p) of the pictures ``which`` (k,) of (n, 3, H * W)."""
+    channels = np.arange(3)[:, None]
+    pictures[which[:, None, None], channels, pixels[:, None, :]] = np.array(colour, np.uint8)[:, None]
+
+
+def draw_for_people(
+    maze: Maze, agent: int | None, goal: int | None, background: np.ndarray | None = None
+) -> Image.Image:
     """Draw cells, blue walls, the goal as a green square and the agent as a red disc, 356 pixels wide for size 6.
 
     Args:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -114,7 +115,7 @@ def build_maze(name: str, size: int = 6) -> Maze:
     if name == "GridWorld":
         return Maze(name, size, frozenset(touching))
     path = [row * size + column for row, column in _spiral(size)]
-    passages = {(min(pair), max(pair)) for pair in zip(path, path[1:], strict=False)}
+    passages = {(min(pair), max(pair)) for pair in pairwise(path)}
     if name == "LoopWorld":
         corner = (size - 2) * size + size - 2
         passages |= {(corner, corner + 1), (corner, corner + size)}

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from repdib_lightning.data.schema import FactorSpec
-from repdib_lightning.environments.distractors import Distractors
+from repdib_lightning.environments.numbered_clips import NumberedClips
 from repdib_lightning.environments.robot_arm_scene import CELLS, LAMPS, TV_SIZE, Moment
 
 ACTIONS = ("forward", "back", "left", "right", "stay")
@@ -61,26 +61,11 @@ def move(cell: int, action: int) -> int:
     return int(3 * row + column)
 
 
-class Television:
-    """The clips that the TV can play, numbered over both splits: training clips first."""
+class Television(NumberedClips):
+    """The clips that the TV can play, (T, 64, 64, 3) uint8 each."""
 
     def __init__(self, source: str, seed: int) -> None:
-        train = Distractors.from_spec(source, "train", seed=seed, size=TV_SIZE, limit=TRAINING_CLIPS)
-        held_out = Distractors.from_spec(source, "evaluation", seed=seed, size=TV_SIZE, limit=EVALUATION_CLIPS)
-        self._pools = (train, held_out)
-
-    def __len__(self) -> int:
-        return len(self._pools[0]) + len(self._pools[1])
-
-    def numbers(self, evaluation: bool) -> np.ndarray:
-        """Clip numbers of the training or of the evaluation pool."""
-        train = len(self._pools[0])
-        return np.arange(train, len(self)) if evaluation else np.arange(train)
-
-    def clip(self, number: int) -> np.ndarray:
-        """(T, 64, 64, 3) uint8."""
-        train = len(self._pools[0])
-        return self._pools[0].clip(number) if number < train else self._pools[1].clip(number - train)
+        super().__init__(source, seed, size=TV_SIZE, limits=(TRAINING_CLIPS, EVALUATION_CLIPS))
 
 
 @dataclass(frozen=True)
