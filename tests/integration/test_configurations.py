@@ -18,6 +18,7 @@ from killing import command_in_processes
 from repdib_lightning.__main__ import VERBS, main
 from repdib_lightning.configurations import packaged, packaged_suites
 from repdib_lightning.environments.collect import collect_robot_arm
+from repdib_lightning.environments.collect_maze import collect_maze
 from repdib_lightning.experiments.suite_file import read_suite
 
 ROOT = Path(__file__).parents[2]
@@ -33,19 +34,37 @@ def recording(tmp_path_factory):
     return collect_robot_arm(path, samples=240, episode_length=24, workers=1, progress=False)
 
 
+@pytest.fixture(scope="session")
+def maze_recording(tmp_path_factory):
+    """A short recording of GridWorld at the real size."""
+    path = tmp_path_factory.mktemp("maze") / "gridworld.h5"
+    return collect_maze(path, samples=240, episode_length=24, progress=False)
+
+
 @pytest.fixture
-def here(tmp_path, monkeypatch, recording):
+def here(tmp_path, monkeypatch, recording, maze_recording):
     monkeypatch.chdir(tmp_path)
     Path("data").mkdir()
+    shutil.copy(maze_recording, "data/gridworld.h5")
     shutil.copy(recording, "data/robot_arm.h5")
     shutil.copy(recording, "data/robot_arm_demo.h5")
     return tmp_path
 
 
-@pytest.mark.parametrize("name", packaged())
-def test_every_configuration_trains(here, name):
-    overlay = [] if name == "robot_arm" else ["--config", name]
-    assert main(["fit", "--config", "robot_arm", *overlay, *SMALL, "--run", "runs/x"]) == 0
+BASES = ("robot_arm", "mazes")
+"""Configurations of a whole run; the others are laid over one of them."""
+
+LAYERS = [
+    *([base] for base in BASES),
+    *(["robot_arm", name] for name in packaged() if name not in BASES),
+    *(["mazes", name] for name in packaged() if name.startswith("bottleneck/")),
+]
+
+
+@pytest.mark.parametrize("layers", LAYERS, ids="+".join)
+def test_every_configuration_trains(here, layers):
+    configurations = [argument for name in layers for argument in ("--config", name)]
+    assert main(["fit", *configurations, *SMALL, "--run", "runs/x"]) == 0
     assert Path("runs/x/checkpoints/step-00000003.ckpt").is_file()
     written = {path.name for path in Path("runs/x").iterdir()}
     assert {"config.yaml", "status.json", "metrics.csv", "environment.json", "bundle.json"} <= written
@@ -62,6 +81,27 @@ def test_a_missing_recording_is_collected_first(here, recording, monkeypatch):
     Path("data/robot_arm.h5").unlink()
     assert main(["fit", *SMALL, "--run", "runs/x"]) == 0
     assert asked == {"samples": 14_000, "seed": 0}
+
+
+def test_a_missing_maze_is_collected_first(here, maze_recording, monkeypatch):
+    asked = {}
+
+    def collect(path, **options):
+        asked.update(options)
+        shutil.copy(maze_recording, path)
+
+    monkeypatch.setattr("repdib_lightning.environments.collect_maze.collect_maze", collect)
+    Path("data/gridworld.h5").unlink()
+    assert main(["fit", "--config", "mazes", *SMALL, "--run", "runs/x"]) == 0
+    assert asked == {"world": "GridWorld", "samples": 10_000, "seed": 0, "distractors": None}
+
+
+def test_the_mazes_go_through_export_and_probe(here, capsys):
+    assert main(["fit", "--config", "mazes", *SMALL, "--run", "runs/x", *QUANTISER_AT_ONCE]) == 0
+    assert main(["export", "runs/x"]) == 0
+    assert main(["probe", "runs/x/bundle", "data/gridworld.h5"]) == 0
+    probed = capsys.readouterr().out
+    assert all(factor in probed for factor in ("position", "goal", "time_step"))
 
 
 def test_the_saved_configuration_is_the_whole_run(here):
