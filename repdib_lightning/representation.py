@@ -10,17 +10,13 @@ import torch
 from lightning.pytorch.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor
 
-from repdib_lightning.bottlenecks.base import Bottleneck
+from repdib_lightning.bottlenecks.base import DEFAULT_LOSS_WEIGHTS, Bottleneck
 from repdib_lightning.encoders.augmentation import random_shift
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.means import SampleMeans
 from repdib_lightning.objectives.base import Objective
 from repdib_lightning.records import Batch, BottleneckOutput, DataSpec, ObjectiveOutput
-
-DEFAULT_LOSS_WEIGHTS = {"kl": 0.01, "commitment": 0.25}
-"""Paper: VIB coefficient 0.01 (all three tables); VQ-VAE: commitment 0.25. Every other term weighs 1."""
-
 
 class RepresentationModule(pl.LightningModule):
     """Learns a representation from a data module that offers a ``spec``.
@@ -184,7 +180,7 @@ class RepresentationModule(pl.LightningModule):
 
 def _shown(name: str) -> bool:
     """Whether the progress bar shows it."""
-    return name.partition("/")[2] in ("loss", "action_accuracy")
+    return name.partition("/")[2] in ("loss", "action_accuracy", "contrast_accuracy")
 
 
 def _named(stage: str, loss: Tensor, output: ObjectiveOutput, terms: dict[str, Tensor]) -> dict[str, Tensor]:

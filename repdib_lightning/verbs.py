@@ -61,6 +61,15 @@ def probe(arguments: list[str]) -> int:
     return 0
 
 
+def finetune(arguments: list[str]) -> int:
+    """``finetune AGENT [options]``."""
+    from repdib_lightning.rl import AGENTS
+
+    name, rest = _choose("finetune", "agent", AGENTS, arguments)
+    print(_call(f"finetune {name}", _load(AGENTS[name]), rest))
+    return 0
+
+
 def compare(arguments: list[str]) -> int:
     """``compare DATA OUTPUT RUN [RUN ...]``: ratios are relative to the first run."""
     from repdib_lightning.evaluation.bundles import named_bundles

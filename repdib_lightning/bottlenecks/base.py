@@ -8,6 +8,9 @@ from repdib_lightning.arguments import RememberedArguments
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import BottleneckOutput
 
+DEFAULT_LOSS_WEIGHTS = {"kl": 0.01, "commitment": 0.25}
+"""Paper: VIB coefficient 0.01 (all three tables); VQ-VAE: commitment 0.25. Every other term weighs 1."""
+
 
 class Bottleneck(RememberedArguments):
     """Maps (N, M) to a :class:`BottleneckOutput` of the same width.

@@ -177,7 +177,7 @@ def evaluation_batches(samples: int, batch_size: int, rank: int = 0, world_size:
     if samples < world_size:
         raise UserError(f"the held-out episodes have {samples} samples, too few for {world_size} processes")
     count = min(-(-samples // batch_size), samples // world_size)
-    return [part.tolist() for part in np.array_split(np.arange(rank, samples, world_size), count)]
+    return [part[rank::world_size].tolist() for part in np.array_split(np.arange(samples), count)]
 
 
 def as_it_is(batch: Any) -> Any:

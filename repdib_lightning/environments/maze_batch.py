@@ -135,6 +135,10 @@ class MazeBatch:
         """Begin an episode of one maze at a chosen cell with a chosen goal (-1: none)."""
         self.cells[index], self.goals[index], self.steps[index] = cell, goal, 0
 
+    def share_background(self) -> None:
+        """Give all mazes the background of the first one, at the same moment."""
+        self._clip[:], self._frame[:] = self._clip[0], self._frame[0]
+
     def move(self, actions: np.ndarray, which: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Move the mazes in the mask (all by default).
 
@@ -194,9 +198,10 @@ class MazeBatch:
 
 
 def training_goals(maze: Maze) -> list[int]:
-    """The centre and the three corners that are not the spiral's mouth: the small finite set of the paper."""
-    last = maze.size - 1
-    return [maze.centre, *(maze.number(corner) for corner in ((0, last), (last, last), (last, 0)))]
+    """The centre and the three cells that make a square with it: a small finite set, as in the paper."""
+    middle = maze.size // 2
+    square = [maze.number((row, column)) for row in (middle - 1, middle) for column in (middle - 1, middle)]
+    return list(dict.fromkeys([maze.centre, *square]))
 
 
 def cell_of(maze: Maze, name: Any, option: str) -> int:

@@ -29,7 +29,7 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.integer]):
         size: cells along each side.
         cell_pixels: pixels along each side of a cell.
         goals: cells that an episode's goal is drawn from, such as ``"centre 0,5"`` or ``[(3, 2)]``; ``none`` for no
-            goal. By default the centre and three corners; in evaluation the centre alone.
+            goal. By default the four cells in the middle, one of them the centre; in evaluation the centre alone.
         start: where episodes begin: ``random`` (any cell but the goal), or a cell.
         evaluation: the goal is the centre, and backgrounds are those kept for evaluation.
         episode_length: steps until truncation.

@@ -1,0 +1,66 @@
+"""The options of ``finetune dqn``, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from repdib_lightning.errors import UserError
+
+CONFIGURATION, OUTCOME = "finetune.json", "outcome.json"
+
+
+@dataclass(frozen=True)
+class DQNOptions:
+    """Described in :func:`repdib_lightning.rl.finetune_dqn.finetune_dqn`, which has the defaults."""
+
+    env: str
+    encoder: Path | None
+    frozen: bool
+    steps: int
+    seed: int
+    env_options: dict[str, Any] | None
+    bottleneck_losses: float
+    learning_rate: float
+    batch_size: int
+    gamma: float
+    tau: float
+    hidden: int
+    buffer_size: int
+    learning_starts: int
+    train_freq: int
+    n_steps: int
+    exploration_fraction: float
+    exploration_final_eps: float
+    features: int
+    channels: int
+    strides: list[int]
+    evaluate_every: int
+    device: str
+
+
+_COUNTS = ("steps", "batch_size", "hidden", "buffer_size", "train_freq", "n_steps", "evaluate_every")
+_SHARES = ("gamma", "tau", "exploration_fraction", "exploration_final_eps")
+
+
+def check_options(options: DQNOptions) -> None:
+    """Raise UserError for a number out of range, or options that exclude each other."""
+    for name in _COUNTS:
+        if getattr(options, name) < 1:
+            raise UserError(f"--{name} must be at least 1, is {getattr(options, name)}")
+    for name in _SHARES:
+        if not 0.0 <= getattr(options, name) <= 1.0:
+            raise UserError(f"--{name} must be in [0, 1], is {getattr(options, name)}")
+    if not options.learning_rate > 0.0:
+        raise UserError(f"--learning_rate must be above 0, is {options.learning_rate}")
+    if options.exploration_fraction == 0.0 or options.tau == 0.0:
+        zero = "exploration_fraction" if options.exploration_fraction == 0.0 else "tau"
+        raise UserError(f"--{zero} must be above 0")
+    for name in ("seed", "learning_starts", "bottleneck_losses"):
+        if not getattr(options, name) >= 0:
+            raise UserError(f"--{name} must not be negative, is {getattr(options, name)}")
+    if options.learning_starts >= options.steps:
+        raise UserError(f"--learning_starts {options.learning_starts}: must be below --steps {options.steps}")
+    if options.frozen and options.encoder is None:
+        raise UserError("--frozen needs --encoder BUNDLE: a fresh encoder that is never trained knows nothing")
