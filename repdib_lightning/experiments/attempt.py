@@ -1,4 +1,4 @@
-"""Runs one point: fit, export, probe, each through the command line that a user would type."""
+"""Runs one point: fit, export, probe, finetune, each through the command line that a user would type."""
 
 from __future__ import annotations
 
@@ -15,9 +15,16 @@ from typing import IO
 from repdib_lightning.callbacks.status_file import read_status
 from repdib_lightning.errors import UserError
 from repdib_lightning.experiments.measures import collect_measures
-from repdib_lightning.experiments.points import PHASES, Point, Record
+from repdib_lightning.experiments.points import OUTCOME, PROBE_FILE, SAMPLES_FILE, Point, Record
 
-PROBE_FILE, SAMPLES_FILE = "probe.json", "probe.npz"
+DEPENDENT = {
+    "fit": ("fit", "export", "probe", "finetune"),
+    "export": ("export", "probe", "finetune"),
+    "probe": ("probe",),
+    "finetune": ("finetune",),
+}
+"""Phase -> what is made of its result, itself included."""
+
 _GRACE = 30.0
 
 
@@ -46,7 +53,7 @@ class Attempt:
             record.error, record.job = "", self.job
             self.point.write(record)
             try:
-                for phase in PHASES:
+                for phase in self.point.setting.phases:
                     self._phase(phase, record, handle)
                 _complete(self.point, record)
             except UserError as error:
@@ -73,19 +80,25 @@ class Attempt:
 
     def _remove_stillborn(self) -> None:
         """Remove what a kill before the first checkpoint left: it cannot go on."""
-        if not any(self.point.folder.glob("checkpoints/*.ckpt")):
+        if self.point.setting.pretrained and not any(self.point.folder.glob("checkpoints/*.ckpt")):
             shutil.rmtree(self.point.folder, ignore_errors=True)
 
     def _phase(self, phase: str, record: Record, handle: int) -> None:
-        if self._is_done(phase):
-            return
+        if phase == "finetune":
+            for name in self.point.unfinished_finetunings():
+                shutil.rmtree(self.point.finetune_folder(name), ignore_errors=True)  # one that was ended cannot go on
+                self._timed(phase, self._finetune_options(name), record, handle, f" {name}")
+        elif not self._is_done(phase):
+            self._timed(phase, self._options(phase), record, handle)
+
+    def _timed(self, phase: str, options: list[str], record: Record, handle: int, which: str = "") -> None:
         began = time.monotonic()
         try:
-            code, last = self._command([phase, *self._options(phase)], handle)
+            code, last = self._command([phase, *options], handle)
         finally:
             record.seconds[phase] = round(record.seconds.get(phase, 0.0) + time.monotonic() - began, 1)
         if code != 0:
-            raise UserError(f"{phase} ended with exit code {code}: {last.removeprefix('error: ')}"[:500])
+            raise UserError(f"{phase}{which} ended with exit code {code}: {last.removeprefix('error: ')}"[:500])
         self.point.write(record)
 
     def _is_done(self, phase: str) -> bool:
@@ -103,10 +116,13 @@ class Attempt:
             return [*words, "--trainer.enable_progress_bar", "false"]
         if phase == "export":
             return [run]
-        suite = self.point.suite
-        chosen = [word for key, value in suite.probe.items() for word in (f"--{key}", str(value))]
+        chosen = [word for key, value in self.point.suite.probe.items() for word in (f"--{key}", str(value))]
         kept = ["--output", f"{run}/{PROBE_FILE}", "--samples", f"{run}/{SAMPLES_FILE}"]
-        return [run, str(suite.data), *kept, *chosen]
+        return [run, str(self.point.setting.data), *kept, *chosen]
+
+    def _finetune_options(self, name: str) -> list[str]:
+        encoder = ["--encoder", str(self.point.folder / "bundle")] if self.point.setting.pretrained else []
+        return [*self.point.finetune[name], *encoder, "--run", str(self.point.finetune_folder(name))]
 
     def _command(self, words: list[str], handle: int) -> tuple[int, str]:
         """Run one command; its output goes to the point's log. Returns the exit code and the last line it printed."""
@@ -145,7 +161,9 @@ def _last_line(log: IO[bytes], began: int) -> str:
 
 def _complete(point: Point, record: Record) -> None:
     """Fill in the record of a point that went through every phase. Raises UserError if a measure is no number."""
-    facts = collect_measures(point.folder, point.folder / PROBE_FILE)
+    probe = point.folder / PROBE_FILE if point.setting.pretrained else None
+    outcomes = {name: point.finetune_folder(name) / OUTCOME for name in point.finetune}
+    facts = collect_measures(point.folder, probe, outcomes)
     for name, value in facts.metrics.items():
         if not math.isfinite(value):
             raise UserError(f"{name} is {value}")
@@ -164,11 +182,11 @@ def stop_all(attempts: Sequence[Attempt], grace: float = _GRACE) -> None:
 
 
 def forget(point: Point, redo: str) -> None:
-    """Make a phase (fit, export or probe) and what follows it undone; nothing where the point is running."""
+    """Make a phase that the point has, and what depends on it, undone; nothing where the point is running."""
     with point.lock() as handle:
         if handle is None:
             return
-        record, redone = point.record(), PHASES[PHASES.index(redo) :]
+        record, redone = point.record(), DEPENDENT[redo]
         record.error, record.finished = "", False
         for phase in redone:
             record.seconds.pop(phase, None)
@@ -178,4 +196,8 @@ def forget(point: Point, redo: str) -> None:
             point.log.unlink(missing_ok=True)
         if "export" in redone:
             shutil.rmtree(point.folder / "bundle", ignore_errors=True)
-        (point.folder / PROBE_FILE).unlink(missing_ok=True)
+        if "probe" in redone:
+            (point.folder / PROBE_FILE).unlink(missing_ok=True)
+        if "finetune" in redone:
+            for name in point.finetune:
+                shutil.rmtree(point.finetune_folder(name), ignore_errors=True)

@@ -1,9 +1,10 @@
-"""The numbers of one finished point, by name: what training logged last, and what the probes read."""
+"""The numbers of one finished point, by name: logged last, read by the probes, and what came of fine-tuning."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ class Facts:
     """What a point's record takes over from its run's folder.
 
     Attributes:
-        configuration: config.yaml as a tree. versions, data: of environment.json.
+        configuration: config.yaml as a tree, and under ``finetune`` what each fine-tuning used.
+        versions, data: of environment.json; without pre-training the versions of the first fine-tuning, and no data.
         factors: name -> ``state`` or ``noise``.
         metrics: name -> number; see :func:`collect_measures`.
     """
@@ -32,8 +34,12 @@ class Facts:
     metrics: dict[str, float]
 
 
-def collect_measures(run: Path, probe: Path) -> Facts:
+def collect_measures(run: Path, probe: Path | None, outcomes: Mapping[str, Path] | None = None) -> Facts:
     """Read a finished run's folder.
+
+    Args:
+        run: the folder. probe: what probing wrote; None for a run without pre-training.
+        outcomes: name of each fine-tuning -> what it wrote.
 
     The measures are
 
@@ -43,11 +49,19 @@ def collect_measures(run: Path, probe: Path) -> Facts:
     - ``decoder/background/kept``, ``.../error``, and the same for ``agent``: of the pictures
       (:mod:`repdib_lightning.evaluation.decoder`);
     - ``codes/used``, ``codes/perplexity``: means over the groups, on held-out episodes;
-    - ``val/...``: what the last validation logged.
+    - ``val/...``: what the last validation logged;
+    - ``AGENT/NAME/...``: of each fine-tuning; what it says null of is left out.
 
     Raises:
         UserError: a file is missing or is not what this package writes.
     """
+    facts = Facts({}, {}, {}, {}, {}) if probe is None else _pretrained(run, probe)
+    for name, path in (outcomes or {}).items():
+        facts = _with_outcome(facts, name, path)
+    return facts
+
+
+def _pretrained(run: Path, probe: Path) -> Facts:
     try:
         configuration = yaml.safe_load((run / "config.yaml").read_text())
         environment = json.loads((run / "environment.json").read_text())
@@ -57,6 +71,19 @@ def collect_measures(run: Path, probe: Path) -> Facts:
     except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
         raise UserError(f"{run}: not a finished and probed run ({type(error).__name__}: {error})") from error
     return Facts(configuration, environment["versions"], environment["data"], factors, metrics)
+
+
+def _with_outcome(facts: Facts, name: str, path: Path) -> Facts:
+    try:
+        outcome = json.loads(path.read_text())
+        metrics = dict(facts.metrics)
+        for measure, value in outcome["measures"].items():
+            _add(metrics, f"{outcome['agent']}/{name}/{measure}", value)
+        used = {**facts.configuration.get("finetune", {}), name: outcome["configuration"]}
+        versions = facts.versions or outcome["versions"]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{path}: not the outcome of a fine-tuning ({type(error).__name__}: {error})") from error
+    return replace(facts, configuration={**facts.configuration, "finetune": used}, versions=versions, metrics=metrics)
 
 
 def _trained(run: Path) -> dict[str, float]:

@@ -17,8 +17,11 @@ from repdib_lightning.data.files import whole_file
 from repdib_lightning.errors import UserError
 from repdib_lightning.experiments.suite import Setting, Suite
 
-PHASES = ("fit", "export", "probe")
-"""Verbs that every point goes through, in this order."""
+OUTCOME = "outcome.json"
+"""What a fine-tuning writes last, in its folder."""
+
+PROBE_FILE, SAMPLES_FILE = "probe.json", "probe.npz"
+"""What probing writes, in the run's folder."""
 
 State = Literal["waiting", "queued", "running", "stopped", "failed", "finished"]
 
@@ -30,6 +33,7 @@ class Record:
     Attributes:
         suite, grid, setting, seed: which point.
         arguments: of ``fit``, without the run's folder; a point keeps them for life.
+        finetune: name of a fine-tuning -> arguments of ``finetune``, without encoder and folder; kept in the same way.
         seconds: phase -> wall seconds, over all attempts.
         error: one line, where the last attempt failed.
         job: of the cluster's queue, or empty.
@@ -45,6 +49,7 @@ class Record:
     setting: str
     seed: int
     arguments: list[str]
+    finetune: dict[str, list[str]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     error: str = ""
     job: str = ""
@@ -57,8 +62,9 @@ class Record:
     metrics: dict[str, float] = field(default_factory=dict)
 
     def line(self) -> str:
-        """The JSON line."""
-        return json.dumps(asdict(self), allow_nan=False)
+        """The JSON line; without a word on fine-tunings where there are none."""
+        content = {name: value for name, value in asdict(self).items() if name != "finetune" or value}
+        return json.dumps(content, allow_nan=False)
 
 
 @dataclass(frozen=True)
@@ -94,14 +100,29 @@ class Point:
         """Of ``fit``, without the run's folder."""
         return self.setting.arguments(self.seed)
 
+    @property
+    def finetune(self) -> dict[str, list[str]]:
+        """Name of each fine-tuning -> arguments of ``finetune``, without encoder and folder."""
+        chosen = self.setting.finetune
+        return {} if chosen is None else {name: chosen.arguments(name, self.seed) for name in chosen.runs}
+
+    def finetune_folder(self, name: str) -> Path:
+        """Of one fine-tuning."""
+        return self.folder / "finetune" / name
+
+    def unfinished_finetunings(self) -> list[str]:
+        """Names of those that have not written their outcome."""
+        return [name for name in self.finetune if not (self.finetune_folder(name) / OUTCOME).is_file()]
+
     def record(self) -> Record:
-        """Read what is known of this point.
+        """Read what is known of this point. One that the suite has added a fine-tuning to is not finished any more.
 
         Raises:
             UserError: the file is damaged, or the folder holds a run with other options.
         """
         if not self.file.is_file():
-            return Record(self.suite.name, self.setting.grid, self.setting.name, self.seed, self.arguments)
+            words = self.arguments
+            return Record(self.suite.name, self.setting.grid, self.setting.name, self.seed, words, self.finetune)
         try:
             record = Record(**json.loads(self.file.read_text()))
         except (OSError, TypeError, ValueError) as error:
@@ -112,7 +133,24 @@ class Point:
                 f"{self.folder}: was run with other options ({was or 'nothing'} then, {now or 'nothing'} now); remove "
                 f"it and {self.file}, or give the suite's new settings another name"
             )
+        record.finished = record.finished and set(self.finetune) <= set(record.finetune)
+        record.finetune = self._checked_finetune(record)
         return record
+
+    def _checked_finetune(self, record: Record) -> dict[str, list[str]]:
+        """What the suite says now, where that is what has been run."""
+        for name, words in self.finetune.items():
+            before, folder = record.finetune.get(name, words), self.finetune_folder(name)
+            if before == words:
+                continue
+            if folder.exists():
+                was, now = _first_difference(before, words)
+                raise UserError(
+                    f"{folder}: was run with other options ({was or 'nothing'} then, {now or 'nothing'} now); remove "
+                    "it, or give the suite's new fine-tuning another name"
+                )
+            record.finished = False
+        return self.finetune
 
     def write(self, record: Record) -> None:
         """Write the record, whole."""
@@ -127,14 +165,25 @@ class Point:
         run = read_status(self.folder) if self.folder.is_dir() else None
         step = f"step {run.step}" if run is not None and run.step else ""
         if self._is_locked():
-            trained = run is not None and run.state == "finished"
-            exported = (self.folder / "bundle").is_dir()
-            return "running", "probe" if exported else "export" if trained else f"fit {step}".strip()
+            return "running", self._doing(run is not None and run.state == "finished", step)
         if record.error:
             return "failed", record.error
         if record.job:
             return "queued", f"job {record.job}"
+        if self.setting.finetune is not None and self._is_probed():
+            begun = run is not None or (self.folder / "finetune").is_dir()
+            return ("stopped", self._doing(True, step)) if begun else ("waiting", "")
         return ("stopped", step) if run is not None else ("waiting", "")
+
+    def _doing(self, trained: bool, step: str) -> str:
+        """What comes next, or runs: the phase, and which step or fine-tuning of it."""
+        if not self._is_probed():
+            return "probe" if (self.folder / "bundle").is_dir() else "export" if trained else f"fit {step}".strip()
+        names = self.unfinished_finetunings() or list(self.finetune)[-1:]
+        return f"finetune {names[0]}" if names else "probe"
+
+    def _is_probed(self) -> bool:
+        return not self.setting.pretrained or (self.folder / PROBE_FILE).is_file()
 
     @contextmanager
     def lock(self) -> Iterator[int | None]:

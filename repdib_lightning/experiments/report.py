@@ -14,11 +14,11 @@ from repdib_lightning.evaluation import figures as probe_figures
 from repdib_lightning.evaluation.report import Section, write_report
 from repdib_lightning.evaluation.samples import ProbeSamples, read_samples
 from repdib_lightning.experiments import figures, tables
-from repdib_lightning.experiments.attempt import PROBE_FILE, SAMPLES_FILE
 from repdib_lightning.experiments.comparison import Difference, Summary, differences, summaries
 from repdib_lightning.experiments.curves import Band, bands, write_bands
 from repdib_lightning.experiments.headline import headline, verdicts
 from repdib_lightning.experiments.page import Part, as_markdown, as_section, facts_of
+from repdib_lightning.experiments.points import PROBE_FILE, SAMPLES_FILE
 from repdib_lightning.experiments.results import Results, load_results
 from repdib_lightning.experiments.run import RUNS, chosen_points
 from repdib_lightning.experiments.suite import Grid

@@ -17,9 +17,9 @@ from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.evaluation.tables import Table
 from repdib_lightning.experiments.attempt import forget
 from repdib_lightning.experiments.executors import Executor, build_executor
-from repdib_lightning.experiments.points import PHASES, Point, State, points_of
+from repdib_lightning.experiments.points import Point, State, points_of
 from repdib_lightning.experiments.slurm import jobs_in_queue
-from repdib_lightning.experiments.suite import Suite, check_seeds
+from repdib_lightning.experiments.suite import PHASES, Suite, check_seeds
 from repdib_lightning.experiments.suite_file import read_suite
 from repdib_lightning.verbs import Outcome
 from repdib_lightning.word_lists import words
@@ -39,7 +39,7 @@ def run_suite(
     redo: str = "",
     runs: Path = RUNS,
 ) -> Outcome:
-    """Run every point of a suite that is not finished: fit, export, probe, each in its own folder.
+    """Run every point of a suite that is not finished: fit, export, probe, finetune, each in its own folder.
 
     What was stopped, killed or failed goes on where it stopped; what is finished is left alone.
 
@@ -50,7 +50,8 @@ def run_suite(
         tune: use the development seeds (100 and up) instead of the reported ones.
         seeds: other seeds than the suite's, between commas.
         only: settings or grids to run, between commas, such as none,repdib.
-        redo: do this phase (fit, export or probe) and what follows it anew; the old results are removed at once.
+        redo: do this phase (fit, export, probe or finetune) and what depends on it anew; the old results are removed
+            at once.
         runs: folder of all suites' runs.
 
     Returns:
@@ -61,15 +62,17 @@ def run_suite(
     """
     plan = read_suite(suite)
     points = chosen_points(plan, tune=tune, seeds=seeds, only=only, runs=runs)
-    if redo and redo not in PHASES:
-        raise UserError(f"--redo: no phase is called '{redo}' {nearest(redo, PHASES)}")
+    known = [phase for phase in PHASES if any(phase in point.setting.phases for point in points)]
+    if redo and redo not in known:
+        raise UserError(f"--redo: no phase is called '{redo}' {nearest(redo, known)}")
     chosen = build_executor(executor, runs / plan.name, jobs, plan.threads, plan.slurm)
     unfinished = ("waiting", "stopped", "failed")
-    todo = [point for point, state, _ in standing(points) if state in unfinished or (state == "finished" and redo)]
-    if todo:
-        prepare_data(plan)
-    if redo:
-        for point in todo:
+    redone = {point.name for point in points if redo in point.setting.phases}
+    stands = [(point, state) for point, state, _ in standing(points)]
+    todo = [p for p, state in stands if state in unfinished or (state == "finished" and p.name in redone)]
+    prepare_data(plan, todo)
+    for point in todo:
+        if point.name in redone:
             forget(point, redo)
     if chosen.returns_at_once:
         chosen.submit(todo)
@@ -135,13 +138,21 @@ def standing(points: Sequence[Point]) -> list[tuple[Point, State, str]]:
     return states
 
 
-def prepare_data(plan: Suite) -> None:
-    """Collect the store where it is absent, once, before anything needs it. Raises UserError if it cannot be read."""
-    if not plan.data.exists() and plan.collect:
-        from repdib_lightning.verbs import collect
+def prepare_data(plan: Suite, points: Sequence[Point]) -> None:
+    """Collect the points' stores where they are absent, before anything needs them.
 
-        collect([plan.collect[0], str(plan.data), *plan.collect[1:]])
-    EpisodeStore(plan.data)
+    Raises:
+        UserError: one of them cannot be read.
+    """
+    commands = {grid.data: grid.collect for grid in plan.grids}
+    for store in dict.fromkeys(point.setting.data for point in points):
+        if store is None:
+            continue
+        if not store.exists() and commands[store]:
+            from repdib_lightning.verbs import collect
+
+            collect([commands[store][0], str(store), *commands[store][1:]])
+        EpisodeStore(store)
 
 
 def summary(points: Sequence[Point]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,28 @@ SET_BY_SUITE = ("seed_everything", "data.seed", "data.init_args.seed", "data.pat
 PROBE_OPTIONS = ("probes", "device", "seed")
 
 
+PHASES = ("fit", "export", "probe", "finetune")
+"""Verbs that points go through, in this order; a setting may have only some of them."""
+
+
+@dataclass(frozen=True)
+class Finetune:
+    """Fine-tunings by reinforcement learning that every point of a setting goes through.
+
+    Attributes:
+        agent: as ``finetune AGENT`` takes it.
+        runs: name -> options of ``finetune``, ``env`` among them; the name is a folder and part of the measures'.
+    """
+
+    agent: str
+    runs: Mapping[str, Mapping[str, Any]]
+
+    def arguments(self, name: str, seed: int) -> list[str]:
+        """What ``finetune`` is given for one of the runs, but for the encoder and the run's folder."""
+        options = [word for key, value in self.runs[name].items() for word in (f"--{key}", _as_word(value))]
+        return [self.agent, *options, "--seed", str(seed)]
+
+
 @dataclass(frozen=True)
 class Setting:
     """One cell of a grid: everything of a run but its seed.
@@ -32,7 +54,10 @@ class Setting:
         grid, name: where it stands; ``grid/name`` is its folder.
         configs: configurations as ``fit --config`` takes them, later ones over earlier ones.
         options: dotted key -> value, over all of them.
-        merged: what these files and options say together; two settings that agree in it are the same run.
+        merged: what these files and options say together.
+        data: the store that it is trained and probed on; None without pre-training.
+        pretrained: whether there is an encoder to train, export and probe; else fine-tuning begins from scratch.
+        finetune: what follows; None for nothing.
     """
 
     grid: str
@@ -40,14 +65,25 @@ class Setting:
     configs: tuple[str, ...]
     options: Mapping[str, Any]
     merged: Mapping[str, Any]
+    data: Path | None = None
+    pretrained: bool = True
+    finetune: Finetune | None = None
 
     @property
     def place(self) -> str:
         """``grid/name``."""
         return f"{self.grid}/{self.name}"
 
+    @property
+    def phases(self) -> tuple[str, ...]:
+        """Those of :data:`PHASES` that its points go through."""
+        before = PHASES[:-1] if self.pretrained else ()
+        return (*before, *PHASES[-1:]) if self.finetune is not None else before
+
     def arguments(self, seed: int) -> list[str]:
-        """What ``fit`` is given, but for the run's folder."""
+        """What ``fit`` is given, but for the run's folder; nothing where there is no fit."""
+        if not self.pretrained:
+            return []
         configs = [word for name in self.configs for word in ("--config", name)]
         options = [word for key, value in self.options.items() for word in (f"--{key}", _as_word(value))]
         return [*configs, *options, "--seed_everything", str(seed), "--data.seed", str(seed)]
@@ -60,12 +96,16 @@ class Grid:
     Attributes:
         name: of the table that it becomes. about: a line above that table.
         settings: in the order of the file; ``baseline`` is the name of the one that the others are compared with.
+        data: the store that its settings are trained and probed on.
+        collect: words of a ``collect`` command that makes the store where it is absent; empty for none.
     """
 
     name: str
     about: str
     baseline: str
     settings: tuple[Setting, ...]
+    data: Path
+    collect: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -84,10 +124,10 @@ class HeadlineRow:
 
 @dataclass(frozen=True)
 class Claim:
-    """A sentence that the report holds against the numbers of the first grid.
+    """A sentence that the report holds against the numbers of a grid.
 
     Attributes:
-        text: the sentence. setting, measure: what it speaks of.
+        text: the sentence. grid: empty for the first one. setting, measure: what it speaks of.
         of: ``value`` of the setting, or its ``difference`` from or ``ratio`` to another one (means, seeds in pairs).
         than: that other setting; the baseline by default.
         at_most, at_least: bounds; None for none.
@@ -102,6 +142,7 @@ class Claim:
     at_most: float | None = None
     at_least: float | None = None
     judge: str = "mean"
+    grid: str = ""
 
 
 @dataclass(frozen=True)
@@ -111,17 +152,17 @@ class Suite:
     Attributes:
         name: the file's name without its ending. title: of the report.
         file: where it was read.
-        data: the store that every point is trained and probed on.
-        collect: words of a ``collect`` command that makes the store where it is absent; empty for none.
+        data, collect: of the grids that have none of their own.
         seeds: reported. tune_seeds: used with ``--tune``.
         threads: of each point's processes; part of the result, since the order of sums depends on it.
         probe: further options of ``probe``.
         slurm: parameters of a SLURM job, by submitit's names.
         grids: by name, in the order of the file.
-        headline: rows of the first grid's table beside the paper's. claims: about the first grid.
+        headline: rows of the first grid's table beside the paper's. claims: held against the numbers.
         measures: shown in the tables beside what the probes read (:mod:`repdib_lightning.experiments.measures`).
-        curves: columns of metrics.csv to draw.
+        curves: columns of metrics.csv to draw. finetune_curves: columns of the fine-tunings' progress.csv to draw.
         show: settings of the first grid whose latents and drawn pictures are shown. colours: factors that colour them.
+        maps: settings whose maps of mazes are shown; empty for all.
     """
 
     name: str
@@ -141,6 +182,12 @@ class Suite:
     curves: tuple[str, ...] = ("train/loss",)
     show: tuple[str, ...] = ()
     colours: tuple[str, ...] = ()
+    finetune_curves: tuple[str, ...] = ("eval/success",)
+    maps: tuple[str, ...] = ()
+
+    def grid(self, name: str) -> Grid:
+        """The grid of this name; the first one for an empty name."""
+        return next((grid for grid in self.grids if grid.name == name), self.grids[0])
 
     @cached_property
     def settings(self) -> list[Setting]:
@@ -161,7 +208,9 @@ class Suite:
 
 def identity(setting: Setting) -> str:
     """A text that is equal for two settings that are the same run."""
-    return json.dumps(setting.merged, sort_keys=True, default=str)
+    finetune = None if setting.finetune is None else asdict(setting.finetune)
+    parts = [setting.merged, setting.data, setting.pretrained, finetune]
+    return json.dumps(parts, sort_keys=True, default=str)
 
 
 def check_seeds(seeds: Sequence[int], *, tune: bool, where: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,26 +10,15 @@ import yaml
 
 from repdib_lightning import configurations
 from repdib_lightning.errors import UserError, nearest
-from repdib_lightning.experiments.merging import merged, with_option
-from repdib_lightning.experiments.suite import (
-    CONFIG,
-    PROBE_OPTIONS,
-    SET_BY_SUITE,
-    Claim,
-    Grid,
-    HeadlineRow,
-    Setting,
-    Suite,
-    check_seeds,
-)
-from repdib_lightning.experiments.suite_checks import (
-    check_choice,
-    check_keys,
-    check_name,
-    check_number,
-    listed,
-    mapping,
-    words,
+from repdib_lightning.experiments.suite import PROBE_OPTIONS, Claim, Grid, HeadlineRow, Suite, check_seeds
+from repdib_lightning.experiments.suite_checks import check_choice, check_keys, check_number, listed, mapping, words
+from repdib_lightning.experiments.suite_grids import (
+    Common,
+    read_collect,
+    read_config,
+    read_finetune,
+    read_grid,
+    read_store,
 )
 
 
@@ -60,17 +48,11 @@ def read_suite(name: str | Path) -> Suite:
         tree = yaml.safe_load(file.read_text())
     except (yaml.YAMLError, ValueError, OSError) as error:
         raise UserError(f"{file}: not valid YAML ({str(error).splitlines()[-1].strip()})") from error
-    check_keys(file, "", tree, {"base", *Suite.__dataclass_fields__} - {"name", "file"})
+    check_keys(file, "", tree, {"base", "finetune", *Suite.__dataclass_fields__} - {"name", "file"})
     for key in ("base", "data", "grids"):
         if key not in tree:
             raise UserError(f"{file}: '{key}' is missing (needed: base, data, grids)")
-    if not isinstance(tree["data"], str) or not tree["data"]:
-        raise UserError(f"{file}: data must name a store, such as data/robot_arm.h5, is {tree['data']!r:.60}")
-    base = [_config(file, "base", item) for item in listed(tree["base"])]
-    grids = tree["grids"]
-    if not isinstance(grids, dict) or not grids:
-        raise UserError(f"{file}: grids must map names to grids, is {grids!r:.60}")
-    built = tuple(_grid(file, name, content, base, Path(tree["data"])) for name, content in grids.items())
+    built = _grids(file, tree)
     known = [setting.name for setting in built[0].settings]
     headline = tree.get("headline")
     threads = tree.get("threads", 1)
@@ -80,8 +62,8 @@ def read_suite(name: str | Path) -> Suite:
         name=file.stem,
         title=str(tree.get("title", file.stem)),
         file=file,
-        data=Path(tree["data"]),
-        collect=_collect(file, tree.get("collect")),
+        data=read_store(file, "data", tree["data"]),
+        collect=read_collect(file, "collect", tree.get("collect")),
         seeds=_seeds(file, "seeds", tree.get("seeds", [0, 1, 2, 3, 4])),
         tune_seeds=_seeds(file, "tune_seeds", tree.get("tune_seeds", [100, 101, 102])),
         threads=threads,
@@ -89,12 +71,45 @@ def read_suite(name: str | Path) -> Suite:
         slurm=mapping(file, "slurm", tree.get("slurm")),
         grids=built,
         headline=tuple(_headline_row(file, *item, known) for item in mapping(file, "headline", headline).items()),
-        claims=tuple(_claim(file, *item, known) for item in mapping(file, "claims", tree.get("claims")).items()),
+        claims=tuple(_claim(file, *item, built) for item in mapping(file, "claims", tree.get("claims")).items()),
         measures=words(file, "measures", tree.get("measures", [])),
         curves=words(file, "curves", tree.get("curves", ["train/loss"])),
-        show=words(file, "show", tree.get("show", []), known),
+        show=_show(file, words(file, "show", tree.get("show", []), known), built[0]),
         colours=words(file, "colours", tree.get("colours", [])),
+        finetune_curves=words(file, "finetune_curves", tree.get("finetune_curves", ["eval/success"])),
+        maps=words(file, "maps", tree.get("maps", []), [s.name for grid in built for s in grid.settings]),
     )
+
+
+def _grids(file: Path, tree: Mapping[str, Any]) -> tuple[Grid, ...]:
+    finetune = mapping(file, "finetune", tree.get("finetune"))
+    read_finetune(file, "finetune", finetune)  # checked even where every grid has its own
+    common = Common(
+        base=tuple(read_config(file, "base", item) for item in listed(tree["base"])),
+        data=read_store(file, "data", tree["data"]),
+        collect=read_collect(file, "collect", tree.get("collect")),
+        finetune=finetune,
+    )
+    grids = tree["grids"]
+    if not isinstance(grids, dict) or not grids:
+        raise UserError(f"{file}: grids must map names to grids, is {grids!r:.60}")
+    built = tuple(read_grid(file, name, content, common) for name, content in grids.items())
+    made: dict[Path, Grid] = {}
+    for grid in built:
+        first = made.setdefault(grid.data, grid)
+        if grid.collect != first.collect:
+            raise UserError(
+                f"{file}: grids.{grid.name}.collect: {grid.data} is made by '{' '.join(first.collect)}' for grid "
+                f"'{first.name}'; give the stores different names"
+            )
+    return built
+
+
+def _show(file: Path, names: tuple[str, ...], grid: Grid) -> tuple[str, ...]:
+    for setting in grid.settings:
+        if setting.name in names and not setting.pretrained:
+            raise UserError(f"{file}: show: '{setting.name}' is not pre-trained, it has no latents to show")
+    return names
 
 
 def _headline_row(file: Path, label: str, content: Any, settings: Sequence[str]) -> HeadlineRow:
@@ -107,12 +122,16 @@ def _headline_row(file: Path, label: str, content: Any, settings: Sequence[str])
     return HeadlineRow(label, str(content.get("measure", "")), paper)
 
 
-def _claim(file: Path, text: str, content: Any, settings: Sequence[str]) -> Claim:
+def _claim(file: Path, text: str, content: Any, grids: Sequence[Grid]) -> Claim:
     key = f"claims.{text}"
     check_keys(file, key, content, set(Claim.__dataclass_fields__) - {"text"})
     for needed in ("setting", "measure"):
         if needed not in content:
             raise UserError(f"{file}: {key}.{needed} is missing")
+    by_name = {grid.name: grid for grid in grids}
+    grid = content.get("grid", grids[0].name)
+    check_choice(file, f"{key}.grid", grid, list(by_name))
+    settings = [setting.name for setting in by_name[grid].settings]
     check_choice(file, f"{key}.setting", content["setting"], settings)
     if "than" in content:
         check_choice(file, f"{key}.than", content["than"], settings)
@@ -124,77 +143,6 @@ def _claim(file: Path, text: str, content: Any, settings: Sequence[str]) -> Clai
     for bound in bounds:
         check_number(file, key, bound)
     return Claim(text, **content)
-
-
-def _grid(file: Path, name: str, content: Any, base: Sequence[str], data: Path) -> Grid:
-    key = f"grids.{name}"
-    check_name(file, key, name)
-    check_keys(file, key, content, {"about", "baseline", "with", "vary"})
-    axes = content.get("vary")
-    if not isinstance(axes, dict) or not axes or not all(isinstance(v, list) and v for v in axes.values()):
-        raise UserError(f"{file}: {key}.vary must map keys to lists of values, is {axes!r:.80}")
-    fixed = mapping(file, f"{key}.with", content.get("with"))
-    _check_options(file, f"{key}.with", fixed)
-    _check_options(file, f"{key}.vary", axes)
-    settings = []
-    for values in itertools.product(*axes.values()):
-        given = dict(zip(axes, values, strict=True))
-        configs = [*base, *(_config(file, key, c) for part in (fixed, given) for c in listed(part.get(CONFIG, [])))]
-        options = {k: v for part in (fixed, given) for k, v in part.items() if k != CONFIG}
-        options = {"data.path": str(data), **options}
-        label = "-".join(_label(axis, value) for axis, value in given.items())
-        settings.append(Setting(name, label, tuple(configs), options, _together(configs, options)))
-    names = [setting.name for setting in settings]
-    for label in names:
-        check_name(file, key, label)
-        if names.count(label) > 1:
-            raise UserError(f"{file}: {key} has two settings called '{label}'; give their files different names")
-    baseline = str(content.get("baseline", names[0]))
-    if baseline not in names:
-        raise UserError(f"{file}: {key}.baseline: no setting is called '{baseline}' {nearest(baseline, names)}")
-    return Grid(name, str(content.get("about", "")), baseline, tuple(settings))
-
-
-def _together(configs: Sequence[str], options: Mapping[str, Any]) -> dict[str, Any]:
-    tree: dict[str, Any] = {}
-    for name in configs:
-        path = configurations.resolve(name)
-        tree = merged(tree, mapping(path, "a configuration", yaml.safe_load(path.read_text())))
-    for key, value in options.items():
-        tree = with_option(tree, key, value)
-    return tree
-
-
-def _label(axis: str, value: Any) -> str:
-    """bottleneck/none -> none; model.bottleneck.init_args.groups, 4 -> groups_4."""
-    if axis == CONFIG:
-        return "-".join(Path(str(item)).name.removesuffix(".yaml") for item in listed(value))
-    return f"{axis.rpartition('.')[2]}_{value}"
-
-
-def _config(file: Path, key: str, name: Any) -> str:
-    """A configuration named in a suite: a file beside the suite's, or what ``--config`` would take."""
-    beside = file.parent / str(name)
-    found = str(beside) if beside.is_file() else str(name)
-    try:
-        configurations.resolve(found)
-    except UserError as error:
-        raise UserError(f"{file}: {key}: {str(error).removeprefix('--config ')}") from error
-    return found
-
-
-def _collect(file: Path, given: Any) -> tuple[str, ...]:
-    if given is not None and not isinstance(given, str):
-        raise UserError(f"{file}: collect must be words of a collect command, such as robot_arm, is {given!r:.60}")
-    return tuple((given or "").split())
-
-
-def _check_options(file: Path, key: str, options: Mapping[Any, Any]) -> None:
-    for option in options:
-        if not isinstance(option, str):
-            raise UserError(f"{file}: {key}: {option!r} is no dotted option of fit, such as model.shift")
-        if option in SET_BY_SUITE:
-            raise UserError(f"{file}: {key}: '{option}' follows from the suite's data and seeds; leave it out")
 
 
 def _seeds(file: Path, key: str, given: Any) -> tuple[int, ...]:

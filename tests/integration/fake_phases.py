@@ -1,4 +1,4 @@
-"""Imitates ``python -m repdib_lightning fit|export|probe`` in milliseconds, to test what a suite does around them.
+"""Imitates ``python -m repdib_lightning fit`` (or export, probe, finetune) in milliseconds.
 
 Put into the place of ``sys.executable`` (:func:`install`). Each command appends ``begin PHASE POINT ...`` to calls.txt,
 and ``end ...`` where it is fit. A file ``orders/PHASE-POINT`` (POINT is SETTING-seed_N) makes a command misbehave:
@@ -8,6 +8,8 @@ and ``end ...`` where it is fit. A file ``orders/PHASE-POINT`` (POINT is SETTING
 - ``wait before checkpoint``: the same before there is one;
 - ``die at the end``: SIGKILL after the last step's checkpoint, before the status says so;
 - ``nan``: training logs a loss that is none.
+
+For finetune, ``fail NAME`` and ``wait NAME`` are about one of a point's fine-tunings.
 """
 
 from __future__ import annotations
@@ -114,17 +116,18 @@ def fit(words: list[str]) -> None:
     note("end fit", f"{run.parent.name}-{run.name}")
 
 
-def wait(run: Path) -> None:
+def wait(run: Path, phase: str = "fit") -> None:
     def leave(number: int, _: object) -> None:
         note("signal", f"{run.parent.name}-{run.name}", number)
-        write_status(run, "preempted" if number == signal.SIGTERM else "interrupted")
+        if phase == "fit":
+            write_status(run, "preempted" if number == signal.SIGTERM else "interrupted")
         sys.exit(128 + number)
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, leave)
     note("waits", f"{run.parent.name}-{run.name}", os.getpid())
     for _ in range(3000):  # not for ever, where a test has failed
-        if not order("fit", run).exists():
+        if not order(phase, run).exists():
             return
         time.sleep(0.01)
 
@@ -148,6 +151,26 @@ def probe(words: list[str]) -> None:
     output.write_text(json.dumps(report))
 
 
+def finetune(words: list[str]) -> None:
+    given = dict(zip(words[1::2], words[2::2], strict=True))
+    folder, environment = Path(given["--run"]), given["--env"]
+    run, name = folder.parent.parent, folder.name
+    encoder = given.get("--encoder", "")
+    assert not encoder or Path(encoder, "config.json").is_file(), encoder
+    note("begin finetune", f"{run.parent.name}-{run.name}", name, encoder or "scratch")
+    folder.mkdir(parents=True)  # as finetune does, it does not go on with one that was ended
+    (folder / "progress.csv").write_text("step,eval/success\n100,0.0\n200,1.0\n")
+    told = ordered("finetune", run)
+    if told == f"fail {name}":
+        breaks()
+    if told == f"wait {name}":
+        wait(run, "finetune")
+    measures = {"success": 0.5 + int(given["--seed"]) / 10, "steps_to_solve": None}
+    outcome = {"agent": words[0], "environment": environment, "versions": {"python": "3"}, "configuration": given,
+               "measures": measures, "maps": {}}  # fmt: skip
+    (folder / "outcome.json").write_text(json.dumps(outcome))
+
+
 if __name__ == "__main__":
     verb, *rest = sys.argv[3:]
-    {"fit": fit, "export": export, "probe": probe}[verb](rest)
+    {"fit": fit, "export": export, "probe": probe, "finetune": finetune}[verb](rest)

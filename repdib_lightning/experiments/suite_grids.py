@@ -1,0 +1,206 @@
+"""Reads the grids of a suite's file: their settings, and the fine-tunings that follow."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from repdib_lightning import configurations
+from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.experiments.merging import merged, with_option
+from repdib_lightning.experiments.suite import CONFIG, SET_BY_SUITE, Finetune, Grid, Setting
+from repdib_lightning.experiments.suite_checks import check_keys, check_name, listed, mapping
+
+PRETRAINED = "pretrained"
+"""Key of a setting: false for one without pre-training."""
+
+SET_FOR_FINETUNE = ("seed", "encoder", "run")
+"""Options of ``finetune`` that follow from the point."""
+
+
+@dataclass(frozen=True)
+class Common:
+    """What the grids of a suite share unless they say otherwise.
+
+    Attributes:
+        base: configurations. data: the store. collect: words of the command that makes it. finetune: as in the file.
+    """
+
+    base: tuple[str, ...]
+    data: Path
+    collect: tuple[str, ...]
+    finetune: Mapping[str, Any]
+
+
+def read_grid(file: Path, name: str, content: Any, common: Common) -> Grid:
+    """One grid. Raises UserError naming the file and the key."""
+    key = f"grids.{name}"
+    check_name(file, key, name)
+    known = {"about", "baseline", "with", "vary", "settings", "data", "collect", "finetune"}
+    check_keys(file, key, content, known)
+    own = _own(file, key, content, common)
+    finetune = read_finetune(file, f"{key}.finetune" if content.get("finetune") else "finetune", own.finetune)
+    fixed = mapping(file, f"{key}.with", content.get("with"))
+    _check_options(file, f"{key}.with", fixed)
+    if PRETRAINED in fixed:
+        raise UserError(f"{file}: {key}: '{PRETRAINED}' is said of a single one, as {key}.settings.NAME.{PRETRAINED}")
+    if "settings" in content and "vary" in content:
+        raise UserError(f"{file}: {key} has both 'vary' and 'settings'; leave one of them out")
+    cells = _named(file, key, content) if "settings" in content else _varied(file, key, content)
+    settings: list[Setting] = []
+    for label, given in cells:
+        check_name(file, key, label)
+        if any(setting.name == label for setting in settings):
+            raise UserError(f"{file}: {key} has two settings called '{label}'; give their files different names")
+        made = _setting(file, key, Setting(name, label, (), {}, {}, finetune=finetune), (fixed, given), own)
+        settings.append(made)
+    names = [setting.name for setting in settings]
+    baseline = str(content.get("baseline", names[0]))
+    if baseline not in names:
+        raise UserError(f"{file}: {key}.baseline: no setting is called '{baseline}' {nearest(baseline, names)}")
+    return Grid(name, str(content.get("about", "")), baseline, tuple(settings), own.data, own.collect)
+
+
+def read_store(file: Path, key: str, given: Any) -> Path:
+    """A store's path."""
+    if not isinstance(given, str) or not given:
+        raise UserError(f"{file}: {key} must name a store, such as data/robot_arm.h5, is {given!r:.60}")
+    return Path(given)
+
+
+def read_collect(file: Path, key: str, given: Any) -> tuple[str, ...]:
+    """Words of a ``collect`` command."""
+    if given is not None and not isinstance(given, str):
+        raise UserError(f"{file}: {key} must be words of a collect command, such as robot_arm, is {given!r:.60}")
+    return tuple((given or "").split())
+
+
+def read_config(file: Path, key: str, name: Any) -> str:
+    """A configuration named in a suite: a file beside the suite's, or what ``--config`` would take."""
+    beside = file.parent / str(name)
+    found = str(beside) if beside.is_file() else str(name)
+    try:
+        configurations.resolve(found)
+    except UserError as error:
+        raise UserError(f"{file}: {key}: {str(error).removeprefix('--config ')}") from error
+    return found
+
+
+def read_finetune(file: Path, key: str, content: Mapping[str, Any]) -> Finetune | None:
+    """Fine-tunings as a file says them; None where there are none."""
+    check_keys(file, key, dict(content), {"agent", "with", "runs"})
+    shared = mapping(file, f"{key}.with", content.get("with"))
+    _check_finetune_options(file, f"{key}.with", shared)
+    runs: dict[str, dict[str, Any]] = {}
+    for name, given in mapping(file, f"{key}.runs", content.get("runs")).items():
+        check_name(file, f"{key}.runs", name)
+        options = mapping(file, f"{key}.runs.{name}", given)
+        _check_finetune_options(file, f"{key}.runs.{name}", options)
+        runs[name] = {**shared, **options}
+        if not isinstance(runs[name].get("env"), str):
+            raise UserError(f"{file}: {key}.runs.{name}.env must name an environment, such as SpiralWorld")
+    if not runs:
+        return None
+    agent = content.get("agent")
+    if not isinstance(agent, str):
+        raise UserError(f"{file}: {key}.agent must name an agent, such as dqn, is {agent!r:.60}")
+    check_name(file, f"{key}.agent", agent)
+    return Finetune(agent, runs)
+
+
+def _own(file: Path, key: str, content: Mapping[str, Any], common: Common) -> Common:
+    """The suite's choices with those of one grid over them. Another store is not made by the suite's command."""
+    if content.get("data") is not None:
+        data = read_store(file, f"{key}.data", content["data"])
+        common = replace(common, data=data, collect=common.collect if data == common.data else ())
+    if content.get("collect") is not None:
+        common = replace(common, collect=read_collect(file, f"{key}.collect", content["collect"]))
+    finetune = mapping(file, f"{key}.finetune", content.get("finetune"))
+    return replace(common, finetune={**common.finetune, **finetune})
+
+
+def _varied(file: Path, key: str, content: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Every combination: name -> what it says."""
+    axes = content.get("vary")
+    if not isinstance(axes, dict) or not axes or not all(isinstance(v, list) and v for v in axes.values()):
+        raise UserError(f"{file}: {key}.vary must map keys to lists of values, is {axes!r:.80}")
+    _check_options(file, f"{key}.vary", axes)
+    if PRETRAINED in axes:
+        raise UserError(f"{file}: {key}.vary: '{PRETRAINED}' cannot vary; name the settings under {key}.settings")
+    given = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+    return [("-".join(_label(axis, value) for axis, value in cell.items()), cell) for cell in given]
+
+
+def _named(file: Path, key: str, content: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """The settings that are written out: name -> what it says."""
+    named = content["settings"]
+    if not isinstance(named, dict) or not named:
+        raise UserError(f"{file}: {key}.settings must map names to settings, is {named!r:.80}")
+    cells = [(name, mapping(file, f"{key}.settings.{name}", given)) for name, given in named.items()]
+    for name, given in cells:
+        _check_options(file, f"{key}.settings.{name}", given)
+    return cells
+
+
+def _setting(file: Path, key: str, bare: Setting, parts: Sequence[Mapping[str, Any]], own: Common) -> Setting:
+    fixed, given = parts
+    if not _is_pretrained(file, f"{key}.settings.{bare.name}", given, bare):
+        return replace(bare, pretrained=False)
+    given = {option: value for option, value in given.items() if option != PRETRAINED}
+    configs = [*own.base, *(read_config(file, key, c) for part in (fixed, given) for c in listed(part.get(CONFIG, [])))]
+    options = {k: v for part in (fixed, given) for k, v in part.items() if k != CONFIG}
+    options = {"data.path": str(own.data), **options}
+    together = _together(configs, options)
+    return replace(bare, configs=tuple(configs), options=options, merged=together, data=own.data)
+
+
+def _is_pretrained(file: Path, key: str, given: Mapping[str, Any], bare: Setting) -> bool:
+    told = given.get(PRETRAINED, True)
+    if not isinstance(told, bool):
+        raise UserError(f"{file}: {key}.{PRETRAINED} must be true or false, is {told!r:.60}")
+    if told:
+        return True
+    for option in given:
+        if option != PRETRAINED:
+            raise UserError(f"{file}: {key}: '{option}' means nothing without pre-training; leave it out")
+    if bare.finetune is None:
+        raise UserError(f"{file}: {key}: neither pre-trained nor fine-tuned; add 'finetune' with runs, or leave it out")
+    return False
+
+
+def _together(configs: Sequence[str], options: Mapping[str, Any]) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for name in configs:
+        path = configurations.resolve(name)
+        tree = merged(tree, mapping(path, "a configuration", yaml.safe_load(path.read_text())))
+    for key, value in options.items():
+        tree = with_option(tree, key, value)
+    return tree
+
+
+def _label(axis: str, value: Any) -> str:
+    """bottleneck/none -> none; model.bottleneck.init_args.groups, 4 -> groups_4."""
+    if axis == CONFIG:
+        return "-".join(Path(str(item)).name.removesuffix(".yaml") for item in listed(value))
+    return f"{axis.rpartition('.')[2]}_{value}"
+
+
+def _check_options(file: Path, key: str, options: Mapping[Any, Any]) -> None:
+    for option in options:
+        if not isinstance(option, str):
+            raise UserError(f"{file}: {key}: {option!r} is no dotted option of fit, such as model.shift")
+        if option in SET_BY_SUITE:
+            raise UserError(f"{file}: {key}: '{option}' follows from the suite's data and seeds; leave it out")
+
+
+def _check_finetune_options(file: Path, key: str, options: Mapping[Any, Any]) -> None:
+    for option in options:
+        if not isinstance(option, str):
+            raise UserError(f"{file}: {key}: {option!r} is no option of finetune, such as steps")
+        if option in SET_FOR_FINETUNE:
+            raise UserError(f"{file}: {key}: '{option}' follows from the suite's seeds and runs; leave it out")
