@@ -36,7 +36,8 @@ SCATTERED = 2000
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd; }
-img { max-width: 100%; } .wide { overflow-x: auto; }
+img { max-width: 100%; } .wide { overflow-x: auto; } .numbers td, .numbers th { white-space: nowrap; }
+.numbers td:first-child, .numbers th:first-child { position: sticky; left: 0; background: #fff; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .25rem .7rem; text-align: right; } th:first-child, td:first-child { text-align: left; }
 thead th, tr.rule td { border-top: 1px solid #888; } thead th { border-bottom: 1px solid #888; }

@@ -11,8 +11,15 @@ from repdib_lightning.experiments import statistics
 from repdib_lightning.experiments.results import Results
 from repdib_lightning.experiments.statistics import Estimate
 from repdib_lightning.experiments.suite import Grid
+from repdib_lightning.rl import AGENTS
 
 Direction = Literal["up", "down", ""]
+
+_REACHED = (
+    *("return", "success", "solved", "coverage", "entropy", "topology", "topology_pairs"),
+    *("mean_return", "mean_success", "final_success", "mean_coverage"),
+)
+_NEEDED = ("steps_to_solve", "moves")
 
 
 @dataclass(frozen=True)
@@ -49,13 +56,16 @@ class Difference:
 def direction(measure: str, factors: dict[str, str]) -> Direction:
     """Whether more of a measure is better (``up``), less is (``down``), or neither.
 
-    State and agent should be kept, noise and background dropped; an error is what was not kept.
+    State and agent should be kept, noise and background dropped; an error is what was not kept. Of fine-tuning
+    (``AGENT/NAME/...``), what was reached should be high, what it took should be low.
     """
     if measure.startswith("codes/"):
         return ""
     if measure.startswith("val/"):
         return "up" if measure.endswith("accuracy") else "down" if measure == "val/loss" or "/raw/" in measure else ""
-    _, target, quantity = measure.split("/")
+    first, target, quantity = measure.split("/", 2)
+    if first in AGENTS:
+        return "up" if quantity in _REACHED else "down" if quantity in _NEEDED else ""
     kind = {**factors, "state": "state", "noise": "noise", "agent": "state", "background": "noise"}.get(target)
     if kind is None or quantity not in ("kept", "error", "rmse"):
         return ""

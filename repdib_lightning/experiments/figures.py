@@ -18,12 +18,19 @@ from repdib_lightning.experiments.results import Results
 from repdib_lightning.experiments.suite import Grid
 
 COLUMNS = 4
+CROWDED = 4
+"""Names under a panel are turned where there are more of them than this."""
+
+_LINES = ("-", "--", ":")
 HINTS = {"up": " (high is good)", "down": " (low is good)", "": ""}
 
 
-def seed_points(results: Results, grid: Grid, measures: Sequence[str]) -> bytes:
-    """One panel a measure: every seed a dot, the mean a bar across them with its 95 % interval."""
-    figure, panels = panel_grid(len(measures), COLUMNS, 3.1, 2.5)
+def seed_points(results: Results, grid: Grid, measures: Sequence[str]) -> bytes | None:
+    """One panel a measure: every seed a dot, the mean a bar across them with its 95 % interval; None for none."""
+    if not measures:
+        return None
+    crowded = len(grid.settings) > CROWDED
+    figure, panels = panel_grid(len(measures), COLUMNS, 3.1, 3.0 if crowded else 2.5)
     for panel, measure in zip(panels, measures, strict=True):
         for place, setting in enumerate(grid.settings):
             values = np.array(list(results.values(setting, measure).values()))
@@ -31,6 +38,8 @@ def seed_points(results: Results, grid: Grid, measures: Sequence[str]) -> bytes:
                 _draw_seeds(panel, place, values, COLOURS[place % len(COLOURS)])
         panel.set_title(measure + HINTS[direction(measure, results.factors)], fontsize=9)
         panel.set_xticks(range(len(grid.settings)), [setting.name for setting in grid.settings], fontsize=8)
+        if crowded:
+            panel.tick_params(axis="x", rotation=40)
         panel.set_xlim(-0.6, len(grid.settings) - 0.4)
         if measure.endswith("/kept"):
             panel.set_ylim(-0.03, 1.05)
@@ -57,16 +66,54 @@ def curves_with_bands(grid: Grid, columns: Mapping[str, Mapping[str, Band]]) -> 
     places = {setting.name: place for place, setting in enumerate(grid.settings)}
     for panel, (column, settings) in zip(panels, columns.items(), strict=True):
         for setting, band in settings.items():
-            colour = COLOURS[places[setting] % len(COLOURS)]
-            panel.fill_between(band.steps, band.low, band.high, color=colour, alpha=0.2, linewidth=0)
-            panel.plot(band.steps, band.mean, color=colour, linewidth=1.3, label=f"{setting} (n={band.seeds})")
+            _draw_band(panel, places[setting], setting, band)
         panel.set_title(column, fontsize=10)
         panel.set_xlabel("step", fontsize=9)
         plain_axes(panel)
+    _legend(figure, panels)
+    return png(figure)
+
+
+def learning_curves_figure(columns: Mapping[str, Mapping[str, Band]], agent: str = "dqn") -> bytes | None:
+    """One panel a fine-tuning: the mean over seeds and its 95 % interval, a line a setting; None if there are none.
+
+    Args:
+        columns: ``AGENT/NAME/COLUMN`` -> setting -> band, of one grid; other columns are left out. From
+            :func:`repdib_lightning.experiments.curves.read_bands` of a report's curves.csv, for instance.
+        agent: whose columns.
+    """
+    shown = {name: settings for name, settings in columns.items() if name.startswith(f"{agent}/")}
+    if not shown:
+        return None
+    figure, panels = panel_grid(len(shown), 3, 4.2, 3.1)
+    names = dict.fromkeys(setting for settings in shown.values() for setting in settings)
+    places = {setting: place for place, setting in enumerate(names)}
+    for panel, (name, settings) in zip(panels, shown.items(), strict=True):
+        for setting, band in settings.items():
+            _draw_band(panel, places[setting], setting, band)
+        _, run, column = name.split("/", 2)
+        panel.set_title(f"{run}: {column}", fontsize=10)
+        panel.set_xlabel("step", fontsize=9)
+        if column.rpartition("/")[2] in ("success", "coverage", "entropy"):
+            panel.set_ylim(-0.03, 1.03)
+        plain_axes(panel)
+    _legend(figure, panels)
+    return png(figure)
+
+
+def _draw_band(panel: Axes, place: int, setting: str, band: Band) -> None:
+    colour, line = COLOURS[place % len(COLOURS)], _LINES[place // len(COLOURS) % len(_LINES)]
+    panel.fill_between(band.steps, band.low, band.high, color=colour, alpha=0.2, linewidth=0)
+    label = f"{setting} (n={band.seeds})"
+    panel.plot(band.steps, band.mean, color=colour, linestyle=line, linewidth=1.3, label=label)
+
+
+def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
+    """Below all panels; taken from the one with most lines."""
     widest = max(panels, key=lambda panel: len(panel.get_legend_handles_labels()[0]))
     handles, labels = widest.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
-    return png(figure)
+    columns = min(len(labels), 3 * len(panels))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
 
 
 def codebook_use(uses: Mapping[str, Sequence[Mapping[str, list[float]]]], codes: int) -> bytes | None:

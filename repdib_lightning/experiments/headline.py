@@ -83,8 +83,8 @@ class Verdict:
 
 
 def verdicts(results: Results) -> list[Verdict]:
-    """Every claim of the suite, on the first grid."""
-    return [_verdict(results, results.suite.grids[0], claim) for claim in results.suite.claims]
+    """Every claim of the suite, on its grid."""
+    return [_verdict(results, results.suite.grid(claim.grid), claim) for claim in results.suite.claims]
 
 
 def _verdict(results: Results, grid: Grid, claim: Claim) -> Verdict:

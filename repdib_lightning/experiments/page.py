@@ -12,6 +12,8 @@ from repdib_lightning.evaluation.tables import Table
 from repdib_lightning.experiments.results import Results
 from repdib_lightning.experiments.tables import markdown
 
+WIDE = 6
+
 
 @dataclass(frozen=True)
 class Part:
@@ -29,9 +31,8 @@ def facts_of(results: Results) -> list[str]:
     versions = ", ".join(f"{name} {number}" for name, number in first.versions.items())
     seconds = sum(sum(record.seconds.values()) for record in results.records.values())
     facts = [
-        f"{len(results.records)} runs of suite '{results.suite.name}', seeds {', '.join(map(str, results.seeds))}, on "
-        f"{first.data.get('file')} (fingerprint {first.data.get('fingerprint')}), {first.threads} thread(s) each, "
-        f"{seconds / 3600:.1f} hours of run time in all.",
+        f"{len(results.records)} runs of suite '{results.suite.name}', seeds {', '.join(map(str, results.seeds))}"
+        f"{_stores(results)}, {first.threads} thread(s) each, {seconds / 3600:.1f} hours of run time in all.",
         f"Versions: {versions}.",
         "Probes are fitted on some held-out episodes and scored on others. Intervals: 95 %, bootstrap over seeds "
         "(percentile, 10,000 resamples); with five seeds they are somewhat too narrow.",
@@ -40,10 +41,20 @@ def facts_of(results: Results) -> list[str]:
         facts.append("ONE SEED: nothing here has a spread; read it as an anecdote.")
     if results.missing:
         facts.append(f"NOT FINISHED, and left out: {', '.join(results.missing)}.")
-    others = {json.dumps(record.versions) for record in results.records.values()}
+    others = {json.dumps(record.versions, sort_keys=True) for record in results.records.values()}
     if len(others) > 1:
         facts.append("The runs were made with different versions; points.jsonl has each one's.")
     return facts
+
+
+def _stores(results: Results) -> str:
+    """What the encoders were trained on; nothing where there are none."""
+    told = [
+        f"{record.data.get('file')} (fingerprint {record.data.get('fingerprint')})"
+        for record in results.records.values()
+        if record.data
+    ]
+    return ", on " + " and ".join(dict.fromkeys(told)) if told else ""
 
 
 def as_markdown(title: str, facts: Sequence[str], parts: Sequence[Part]) -> str:
@@ -58,6 +69,11 @@ def as_markdown(title: str, facts: Sequence[str], parts: Sequence[Part]) -> str:
 def as_section(part: Part) -> Section:
     """One part of the HTML page, its figures inside."""
     body = [f"<p>{html.escape(sentence)}</p>" for sentence in part.sentences]
-    body += [f'<div class="wide">{table.html()}</div>' for table in part.tables]
+    body += [f'<div class="{_width(table)}">{table.html()}</div>' for table in part.tables]
     body += [picture(content, name) for name, content in part.figures.items()]
     return Section(part.title, "\n".join(body))
+
+
+def _width(table: Table) -> str:
+    """A table of many columns of numbers is pushed sideways under its first column instead of breaking its cells."""
+    return "wide numbers" if len(table.header) > WIDE else "wide"

@@ -15,14 +15,17 @@ from repdib_lightning.evaluation.report import Section, write_report
 from repdib_lightning.evaluation.samples import ProbeSamples, read_samples
 from repdib_lightning.experiments import figures, tables
 from repdib_lightning.experiments.comparison import Difference, Summary, differences, summaries
-from repdib_lightning.experiments.curves import Band, bands, write_bands
+from repdib_lightning.experiments.curves import Band, bands, finetune_bands, write_bands
+from repdib_lightning.experiments.finetune_parts import finetune_parts, training_only
 from repdib_lightning.experiments.headline import headline, verdicts
+from repdib_lightning.experiments.maze_maps import Maps, mean_maps, write_maps
 from repdib_lightning.experiments.page import Part, as_markdown, as_section, facts_of
 from repdib_lightning.experiments.points import PROBE_FILE, SAMPLES_FILE
 from repdib_lightning.experiments.results import Results, load_results
 from repdib_lightning.experiments.run import RUNS, chosen_points
 from repdib_lightning.experiments.suite import Grid
 from repdib_lightning.experiments.suite_file import read_suite
+from repdib_lightning.rl import AGENTS
 
 RESULTS = Path("results")
 Numbers = dict[str, tuple[list[Summary], list[Difference]]]
@@ -49,10 +52,13 @@ def report_suite(
     results = load_results(plan, dict.fromkeys(point.seed for point in points), runs)
     folder = output or (runs / plan.name / "report" if tune else RESULTS / plan.name)
     check_output_file(folder / "report.html", "--output", ".html")
-    all_bands = {grid.name: bands(results, grid) for grid in plan.grids}
+    all_bands = {grid.name: bands(results, grid) | finetune_bands(results, grid) for grid in plan.grids}
+    all_maps = {grid.name: mean_maps(results, grid) for grid in plan.grids}
     found = {grid.name: (summaries(results, grid), differences(results, grid)) for grid in plan.grids}
-    parts = [*_headline_part(results), *_grid_parts(results, found, all_bands), *_latent_parts(results)]
+    parts = [*_headline_part(results), *_grid_parts(results, found, all_bands, all_maps), *_latent_parts(results)]
     _write(folder, results, parts, all_bands)
+    if any(all_maps.values()):
+        write_maps(folder / "maps.json", all_maps)
     tables.write_summaries(folder / "summary.csv", [row for rows, _ in found.values() for row in rows])
     tables.write_differences(folder / "differences.csv", [row for _, rows in found.values() for row in rows])
     missing = f"    {len(results.missing)} not finished: {', '.join(results.missing[:4])}" if results.missing else ""
@@ -65,7 +71,7 @@ def _headline_part(results: Results) -> list[Part]:
     lines, found = headline(results), verdicts(results)
     shown = [tables.headline_table(results, lines), tables.absolute_table(results, lines)] if lines else []
     if found:
-        shown.append(tables.claims_table(found, suite.grids[0].baseline))
+        shown.append(tables.claims_table(found, suite))
     if not shown:
         return []
     grid = suite.grids[0]
@@ -81,7 +87,9 @@ def _headline_part(results: Results) -> list[Part]:
     return [Part("The paper's table, and ours", sentences, shown, {})]
 
 
-def _grid_parts(results: Results, found: Numbers, all_bands: dict[str, dict[str, dict[str, Band]]]) -> list[Part]:
+def _grid_parts(
+    results: Results, found: Numbers, all_bands: dict[str, dict[str, dict[str, Band]]], all_maps: dict[str, Maps]
+) -> list[Part]:
     parts = []
     for grid in results.suite.grids:
         measures = table_measures(results, grid)
@@ -89,40 +97,46 @@ def _grid_parts(results: Results, found: Numbers, all_bands: dict[str, dict[str,
             tables.summary_table(results, grid, found[grid.name][0], measures),
             tables.difference_table(results, grid, found[grid.name][1], measures),
         ]
-        drawn = {f"{grid.name}-seeds": figures.seed_points(results, grid, _drawn_measures(measures))}
-        drawn |= _known(f"{grid.name}-curves", figures.curves_with_bands(grid, all_bands[grid.name]))
+        drawn = _known(f"{grid.name}-seeds", figures.seed_points(results, grid, _drawn_measures(measures)))
+        drawn |= _known(f"{grid.name}-curves", figures.curves_with_bands(grid, training_only(all_bands[grid.name])))
         drawn |= _known(f"{grid.name}-codebooks", _codebooks(results, grid))
         sentences = [grid.about] if grid.about else []
         sentences.append(
             "↑ more is better, ↓ less is better. P: probability that a run is better than one of the baseline."
         )
         parts.append(Part(f"Grid: {grid.name}", sentences, shown, drawn))
+        parts += finetune_parts(grid, all_bands[grid.name], all_maps[grid.name])
     return parts
 
 
 def table_measures(results: Results, grid: Grid) -> list[str]:
     """What the tables show: kept of all factors (first probe) and of the pictures, codes, and what the suite names."""
     known = results.measures(grid)
+    anywhere = dict.fromkeys(name for each in results.suite.grids for name in results.measures(each))
     first = known[0].partition("/")[0] if known else ""
     first = next((name.partition("/")[0] for name in known if name.endswith("/kept")), first)
     kept = [name for name in known if name.endswith("/kept") and name.partition("/")[0] in (first, "decoder")]
     means = [name for name in kept if name.split("/")[1] in ("state", "noise")]
     for name in results.suite.measures:
-        if name not in known:
-            raise UserError(f"{results.suite.file}: measures: no point has '{name}' {nearest(name, known)}")
+        if name not in anywhere:
+            raise UserError(f"{results.suite.file}: measures: no point has '{name}' {nearest(name, anywhere)}")
+    chosen = [name for name in results.suite.measures if name in known]
     codes = [name for name in known if name.startswith("codes/")]
-    return [*means, *[name for name in kept if name not in means], *results.suite.measures, *codes]
+    return [*means, *[name for name in kept if name not in means], *chosen, *codes]
 
 
 def _drawn_measures(measures: Sequence[str]) -> list[str]:
-    return [name for name in measures if name.endswith("/kept")] + [m for m in measures if m.startswith("codes/used")]
+    """Kept, reached by fine-tuning, and codes in use."""
+    reached = [name for name in measures if name.partition("/")[0] in AGENTS]
+    codes = [name for name in measures if name.startswith("codes/used")]
+    return [name for name in measures if name.endswith("/kept")] + reached + codes
 
 
 def _codebooks(results: Results, grid: Grid) -> bytes | None:
     uses: dict[str, list[dict[str, list[float]]]] = {}
     codes = 0
     for setting in grid.settings:
-        for seed in results.seeds:
+        for seed in results.seeds if setting.pretrained else ():
             point = results.point(setting, seed)
             use = json.loads((point.folder / PROBE_FILE).read_text())["codebook"] if point else None
             if use is not None:

@@ -47,8 +47,8 @@ class Results:
 
     @property
     def factors(self) -> dict[str, str]:
-        """Name -> ``state`` or ``noise``."""
-        return next(iter(self.records.values())).factors
+        """Name -> ``state`` or ``noise``, of all data."""
+        return {name: kind for record in self.records.values() for name, kind in record.factors.items()}
 
     def measures(self, grid: Grid) -> list[str]:
         """Names of all measures that a setting of the grid has, in order of first appearance."""
@@ -84,9 +84,14 @@ def load_results(suite: Suite, seeds: Iterable[int], runs: Path) -> Results:
 
 
 def _check_same_data(points: dict[tuple[str, int], Point], records: dict[tuple[str, int], Record]) -> None:
-    """Settings may only be compared on the same data."""
-    key, first = next(iter(records.items()))
+    """A store is the same for all that were trained on it; without pre-training there is none."""
+    firsts: dict[Path, tuple[str, int]] = {}
     for other, record in records.items():
+        store = points[other].setting.data
+        if store is None:
+            continue
+        key = firsts.setdefault(store, other)
+        first = records[key]
         if record.data.get("fingerprint") != first.data.get("fingerprint"):
             raise UserError(
                 f"{points[other].folder}: was trained on other data than {points[key].folder} (fingerprints differ); "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,12 +16,13 @@ from repdib_lightning import configurations
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.experiments.merging import merged, with_option
 from repdib_lightning.experiments.suite import CONFIG, SET_BY_SUITE, Finetune, Grid, Setting
-from repdib_lightning.experiments.suite_checks import check_keys, check_name, listed, mapping
+from repdib_lightning.experiments.suite_checks import check_choice, check_keys, check_name, listed, mapping
+from repdib_lightning.rl import AGENTS
 
 PRETRAINED = "pretrained"
 """Key of a setting: false for one without pre-training."""
 
-SET_FOR_FINETUNE = ("seed", "encoder", "run")
+SET_FOR_FINETUNE = ("seed", "encoder", "run", "overwrite")
 """Options of ``finetune`` that follow from the point."""
 
 
@@ -95,21 +98,23 @@ def read_finetune(file: Path, key: str, content: Mapping[str, Any]) -> Finetune 
     """Fine-tunings as a file says them; None where there are none."""
     check_keys(file, key, dict(content), {"agent", "with", "runs"})
     shared = mapping(file, f"{key}.with", content.get("with"))
-    _check_finetune_options(file, f"{key}.with", shared)
+    given = mapping(file, f"{key}.runs", content.get("runs"))
+    if not given:
+        return None
+    if not isinstance(content.get("agent"), str):
+        raise UserError(f"{file}: {key}.agent must name an agent, such as dqn, is {content.get('agent')!r:.60}")
+    agent = content["agent"]
+    check_choice(file, f"{key}.agent", agent, list(AGENTS))
+    known = _options_of(agent)
+    _check_finetune_options(file, f"{key}.with", shared, known)
     runs: dict[str, dict[str, Any]] = {}
-    for name, given in mapping(file, f"{key}.runs", content.get("runs")).items():
+    for name, own in given.items():
         check_name(file, f"{key}.runs", name)
-        options = mapping(file, f"{key}.runs.{name}", given)
-        _check_finetune_options(file, f"{key}.runs.{name}", options)
+        options = mapping(file, f"{key}.runs.{name}", own)
+        _check_finetune_options(file, f"{key}.runs.{name}", options, known)
         runs[name] = {**shared, **options}
         if not isinstance(runs[name].get("env"), str):
             raise UserError(f"{file}: {key}.runs.{name}.env must name an environment, such as SpiralWorld")
-    if not runs:
-        return None
-    agent = content.get("agent")
-    if not isinstance(agent, str):
-        raise UserError(f"{file}: {key}.agent must name an agent, such as dqn, is {agent!r:.60}")
-    check_name(file, f"{key}.agent", agent)
     return Finetune(agent, runs)
 
 
@@ -198,9 +203,17 @@ def _check_options(file: Path, key: str, options: Mapping[Any, Any]) -> None:
             raise UserError(f"{file}: {key}: '{option}' follows from the suite's data and seeds; leave it out")
 
 
-def _check_finetune_options(file: Path, key: str, options: Mapping[Any, Any]) -> None:
+def _options_of(agent: str) -> list[str]:
+    """Options of ``finetune AGENT`` that a suite may give."""
+    module, _, function = AGENTS[agent].partition(":")
+    names = inspect.signature(getattr(importlib.import_module(module), function)).parameters
+    return [name for name in names if name not in SET_FOR_FINETUNE]
+
+
+def _check_finetune_options(file: Path, key: str, options: Mapping[Any, Any], known: Sequence[str]) -> None:
     for option in options:
         if not isinstance(option, str):
             raise UserError(f"{file}: {key}: {option!r} is no option of finetune, such as steps")
         if option in SET_FOR_FINETUNE:
             raise UserError(f"{file}: {key}: '{option}' follows from the suite's seeds and runs; leave it out")
+        check_choice(file, key, option.partition(".")[0], known)

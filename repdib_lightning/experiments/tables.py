@@ -12,7 +12,7 @@ from repdib_lightning.experiments.comparison import Difference, Summary, directi
 from repdib_lightning.experiments.headline import READINGS, HeadlineLine, Verdict
 from repdib_lightning.experiments.results import Results
 from repdib_lightning.experiments.statistics import Estimate
-from repdib_lightning.experiments.suite import Grid
+from repdib_lightning.experiments.suite import Grid, Suite
 
 ARROWS = {"up": " ↑", "down": " ↓", "": ""}
 NOTHING = "-"
@@ -72,16 +72,18 @@ def summary_table(results: Results, grid: Grid, found: Sequence[Summary], measur
     rows = []
     for measure in measures:
         row = [measure + ARROWS[direction(measure, results.factors)]]
-        row += [_summary_cell(cells.get((name, measure))) for name in names]
+        row += [_summary_cell(cells.get((name, measure)), seeds[name]) for name in names]
         rows.append(row)
     return Table(header, rows)
 
 
-def _summary_cell(row: Summary | None) -> str:
+def _summary_cell(row: Summary | None, seeds: int) -> str:
+    """A measure that some of the seeds lack says of how many it is."""
     if row is None:
         return NOTHING
     value, _, rest = interval(row.mean).partition(" ")
-    return f"{value} ({number(row.iqm.value)}) {rest}".rstrip()
+    fewer = f"n={row.n}" if row.n < seeds else ""
+    return " ".join(part for part in (value, f"({number(row.iqm.value)})", rest, fewer) if part)
 
 
 def difference_table(results: Results, grid: Grid, found: Sequence[Difference], measures: Sequence[str]) -> Table:
@@ -104,7 +106,7 @@ def difference_table(results: Results, grid: Grid, found: Sequence[Difference], 
     return Table(header, rows)
 
 
-def claims_table(found: Sequence[Verdict], baseline: str) -> Table:
+def claims_table(found: Sequence[Verdict], suite: Suite) -> Table:
     """Each claim, its number, and whether it holds."""
     rows = []
     for verdict in found:
@@ -113,8 +115,10 @@ def claims_table(found: Sequence[Verdict], baseline: str) -> Table:
         bounds += [f"at least {claim.at_least}"] * (claim.at_least is not None)
         asked = " and ".join(bounds) + {"mean": "", "whole": ", whole interval", "any": ", some of it"}[claim.judge]
         holds = {True: "holds", False: "FAILS", None: "cannot be told"}[verdict.holds]
-        other = "" if claim.of == "value" else f" against {claim.than or baseline}"
-        about = f"{claim.of} of {claim.measure}, {claim.setting}{other}"
+        grid = suite.grid(claim.grid)
+        other = "" if claim.of == "value" else f" against {claim.than or grid.baseline}"
+        where = "" if grid is suite.grids[0] else f" (grid {grid.name})"
+        about = f"{claim.of} of {claim.measure}, {claim.setting}{other}{where}"
         rows.append([claim.text, about, interval(verdict.estimate), asked, holds])
     return Table(["claim", "measured by", "found", "asked for", ""], rows)
 
