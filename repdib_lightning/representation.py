@@ -18,6 +18,7 @@ from repdib_lightning.means import SampleMeans
 from repdib_lightning.objectives.base import Objective
 from repdib_lightning.records import Batch, BottleneckOutput, DataSpec, ObjectiveOutput
 
+
 class RepresentationModule(pl.LightningModule):
     """Learns a representation from a data module that offers a ``spec``.
 

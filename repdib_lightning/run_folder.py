@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import json
-import platform
 import shutil
 import time
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.versions import versions
 
 CONFIGURATION = "config.yaml"
-_VERSIONED = ("repdib_lightning", "torch", "torchvision", "lightning", "numpy", "h5py", "mujoco", "dm_control")
 
 
 @rank_zero_only
@@ -80,14 +77,3 @@ def existing(folder: Path) -> Path:
         runs = [str(path.parent) for path in folder.parent.glob(f"*/{CONFIGURATION}")] if folder.parent.is_dir() else []
         raise UserError(f"{folder}: no such run ({CONFIGURATION} is missing); {nearest(str(folder), runs)}")
     return folder
-
-
-def versions() -> dict[str, Any]:
-    """Versions of Python and of the packages that a result depends on."""
-    found: dict[str, Any] = {"python": platform.python_version()}
-    for name in _VERSIONED:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found

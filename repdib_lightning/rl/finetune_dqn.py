@@ -34,7 +34,7 @@ def finetune_dqn(
     exploration_fraction: float = 0.3,
     exploration_final_eps: float = 0.05,
     features: int = 128,
-    channels: int = 32,
+    channels: int = 16,
     strides: list[int] = [3, 2],  # noqa: B006 (read from the signature, never changed)
     evaluate_every: int = 250,
     device: str = "auto",

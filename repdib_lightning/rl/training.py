@@ -29,7 +29,7 @@ from repdib_lightning.rl.finetune_dqn import plain
 from repdib_lightning.rl.options import CONFIGURATION, OUTCOME, DQNOptions
 from repdib_lightning.rl.progress import POLICY, Progress
 from repdib_lightning.rl.visits import CountVisits
-from repdib_lightning.run_folder import versions
+from repdib_lightning.versions import versions
 
 
 class Training:
@@ -199,5 +199,3 @@ def report(outcome: dict[str, Any]) -> str:
     if "coverage" in found:
         words.append(f"was in {100 * found['coverage']:.0f} % of the cells")
     return ", ".join(words)
-
-
