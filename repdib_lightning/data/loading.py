@@ -168,8 +168,9 @@ class _SampleNumbers:
 def evaluation_batches(samples: int, batch_size: int, rank: int = 0, world_size: int = 1) -> list[list[int]]:
     """Sample numbers of each batch of one process, which together hold every sample once.
 
-    Each process has as many batches as the others, of sizes that differ by one at most: none is padded, and none waits
-    for another that has ended.
+    Together the processes see the batches that one would see, which losses that compare samples depend on. Each has
+    as many batches as the others, of sizes that differ by one at most: none is padded, and none waits for another that
+    has ended.
 
     Raises:
         UserError: fewer samples than processes.

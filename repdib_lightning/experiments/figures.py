@@ -74,15 +74,20 @@ def curves_with_bands(grid: Grid, columns: Mapping[str, Mapping[str, Band]]) -> 
     return png(figure)
 
 
-def learning_curves_figure(columns: Mapping[str, Mapping[str, Band]], agent: str = "dqn") -> bytes | None:
+def learning_curves_figure(
+    columns: Mapping[str, Mapping[str, Band]], shown_column: str = "", agent: str = "dqn"
+) -> bytes | None:
     """One panel a fine-tuning: the mean over seeds and its 95 % interval, a line a setting; None if there are none.
 
     Args:
         columns: ``AGENT/NAME/COLUMN`` -> setting -> band, of one grid; other columns are left out. From
             :func:`repdib_lightning.experiments.curves.read_bands` of a report's curves.csv, for instance.
+        shown_column: of each fine-tuning's progress, such as ``eval/success``; all by default.
         agent: whose columns.
     """
-    shown = {name: settings for name, settings in columns.items() if name.startswith(f"{agent}/")}
+    parts = {name: name.split("/", 2) for name in columns}
+    wanted = [name for name, (by, *rest) in parts.items() if by == agent and shown_column in ("", rest[-1])]
+    shown = {name: columns[name] for name in wanted}
     if not shown:
         return None
     figure, panels = panel_grid(len(shown), 3, 4.2, 3.1)

@@ -29,13 +29,15 @@ def finetune_parts(grid: Grid, columns: Mapping[str, Mapping[str, Band]], maps: 
     finetune = next((setting.finetune for setting in grid.settings if setting.finetune is not None), None)
     if finetune is None:
         return []
+    logged = dict.fromkeys(name.split("/", 2)[2] for name in columns if name.startswith(f"{finetune.agent}/"))
     made = {
-        "learning": learning_curves_figure(columns, finetune.agent),
+        **{f"learning-{c.replace('/', '-')}": learning_curves_figure(columns, c, finetune.agent) for c in logged},
         "coverage": coverage_figure(maps),
         "topology": topology_figure(maps),
     }
     drawn = {name: content for name, content in made.items() if content is not None}
-    sentences = [_told(finetune), *[SENTENCES[name] for name in drawn]]
+    told = dict.fromkeys(SENTENCES[name.partition("-")[0]] for name in drawn)
+    sentences = [_told(finetune), *told]
     figures = {f"{grid.name}-{name}": content for name, content in drawn.items()}
     return [Part(f"Fine-tuning: {grid.name}", sentences, [], figures)]
 

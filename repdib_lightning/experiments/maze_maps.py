@@ -207,12 +207,16 @@ def _outcome(point: Point, name: str) -> dict[str, Any]:
 
 
 def _mean(outcomes: list[dict[str, Any]]) -> MeanMaps:
-    """Over seeds of one setting and one fine-tuning."""
+    """Over seeds of one setting and one fine-tuning. Without a goal the latents' distances are left out: the encoder
+    never saw the picture that they are measured in.
+    """
     prepare = {"visits": _shares, "latent_distance": _relative}
     found: dict[str, Any] = {}
     for kind in _KINDS:
         each = [np.array(outcome["maps"][kind], float) for outcome in outcomes if outcome["maps"].get(kind)]
         each = [prepare[kind](values) for values in each] if kind in prepare else each
+        if kind != "visits" and not any("success" in outcome["measures"] for outcome in outcomes):
+            each = []
         found[kind] = np.mean(each, axis=0) if each else None
     correlations = [o["measures"]["topology"] for o in outcomes if o["measures"].get("topology") is not None]
     topology = float(np.mean(correlations)) if correlations else None

@@ -117,7 +117,7 @@ def test_the_report_has_curves_and_maps_of_each_grid_and_the_numbers_of_both(mad
     report_suite(path, output=tmp_path / "b", runs=runs)
     names = {file.name for file in (tmp_path / "a").iterdir()}
     for grid in ("clean", "noisy"):
-        assert {f"{grid}-learning.png", f"{grid}-coverage.png", f"{grid}-topology.png"} <= names
+        assert {f"{grid}-learning-eval-success.png", f"{grid}-coverage.png", f"{grid}-topology.png"} <= names
     assert all((tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes() for name in names)
     text = (tmp_path / "a/report.md").read_text()
     assert "x.h5 (fingerprint abc) and noisy.h5 (fingerprint other)" in text
