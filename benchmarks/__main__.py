@@ -23,10 +23,11 @@ COMMANDS = {
     "training_step": ["training_step"],
     "encoding": ["encoding"],
     "start": ["start"],
+    "mazes": ["mazes"],
     "offline_run": ["offline_run"],
 }
 ON = {
-    "cpu": ["quantiser", "quantiser_kept", "data_path", "training_step", "encoding", "start"],
+    "cpu": ["quantiser", "quantiser_kept", "data_path", "training_step", "encoding", "start", "mazes"],
     "cuda": ["quantiser", "data_path", "training_step", "encoding", "offline_run"],
 }
 ROOT = Path(__file__).parent.parent

@@ -135,6 +135,8 @@ def test_every_command_of_the_readme(here, monkeypatch):
         small: list[str] = []
         if command[0] == "suite":
             continue  # test_the_suite_of_the_readme, on fewer points
+        if command[0] == "finetune":
+            small = ["--steps", "60", "--learning_starts", "30", "--evaluate_every", "30"]
         if command[0] == "fit":
             small = SMALL if "--resume" not in command else ["--trainer.max_steps", "4"]
             if "bottleneck/none" not in command and "--resume" not in command:
@@ -158,8 +160,7 @@ def test_the_python_of_the_readme(here):
 
 def test_the_suite_of_the_readme(here, capsys):
     """The packaged suite, cut down to two points of three steps: run, status, report."""
-    commands = [command for command in readme_commands() if command[0] == "suite"]
-    assert [command[1:] for command in commands] == [[verb, "robot_arm"] for verb in ("run", "status", "report")]
+    commands = suite_commands("robot_arm")
     plan = yaml.safe_load(packaged_suites()["robot_arm"].read_text())
     steps = {"config": "steps.yaml", "trainer.max_steps": 3, "trainer.val_check_interval": 2}
     plan["grids"] = {"bottleneck": {"with": steps, "vary": {"config": ["bottleneck/none", "bottleneck/repdib"]}}}
@@ -174,6 +175,45 @@ def test_the_suite_of_the_readme(here, capsys):
         assert "2 finished of 2" in capsys.readouterr().out or command[1] == "report"
     written = {path.name for path in Path("results/robot_arm").iterdir()}
     assert {"report.md", "report.html", "latents.png", "drawn.png", "bottleneck-codebooks.png"} <= written
+
+
+def suite_commands(name: str) -> list[list[str]]:
+    """What the README says of a suite."""
+    commands = [command for command in readme_commands() if command[0] == "suite" and command[2] == name]
+    assert [command[1] for command in commands] == ["run", "status", "report"]
+    return commands
+
+
+def test_the_suite_of_the_mazes(here, capsys):
+    """The packaged suite with every fine-tuning, on two points, few steps and one seed."""
+    plan = yaml.safe_load(packaged_suites()["mazes"].read_text())
+    small = {"steps": 60, "learning_starts": 30, "evaluate_every": 30}
+    for run in plan["finetune"]["runs"].values():
+        run |= small
+    Path("steps.yaml").write_text(
+        yaml.safe_dump(
+            {
+                "data": {"batch_size": 8},
+                "trainer": {"max_steps": 3, "val_check_interval": 2},
+                "model": {"bottleneck": {"class_path": "RepDIB", "init_args": {"start_step": 1, "groups": 16}}},
+            }
+        )
+    )
+    settings = {"dqn": {"pretrained": False}, "repdib_16": {"config": "steps.yaml"}}
+    plan["grids"] = {"mazes": {"baseline": "dqn", "settings": settings}}
+    plan["claims"] = {
+        text: claim
+        for text, claim in plan["claims"].items()
+        if claim["setting"] == "repdib_16" and claim.get("grid", "mazes") == "mazes" and "noise" not in text
+    }
+    plan |= {"seeds": [0], "show": ["repdib_16"]}
+    Path("mazes.yaml").write_text(yaml.safe_dump(plan))
+    for command in suite_commands("mazes"):
+        assert main([*command[:2], "mazes.yaml"]) == 0
+        assert "2 finished of 2" in capsys.readouterr().out or command[1] == "report"
+    written = {path.name for path in Path("results/mazes").iterdir()}
+    figures = {"mazes-learning-eval-success.png", "mazes-coverage.png", "mazes-topology.png", "latents.png"}
+    assert {"report.md", "report.html", "maps.json", "curves.csv", *figures} <= written
 
 
 @pytest.mark.parametrize("name", packaged_suites())
