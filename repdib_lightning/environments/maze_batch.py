@@ -15,6 +15,9 @@ from repdib_lightning.errors import UserError, nearest
 
 NO_GOAL = -1
 SMALLEST_CELL, LARGEST_CELL = 3, 64
+STEPS_A_CELL = 1.4
+"""Of an episode, by default: enough for the longest corridor, 35 moves of 36 cells, and some errors."""
+
 CellName = str | Sequence[int]
 """A cell as users name it: ``centre``, ``"row,column"`` or (row, column)."""
 
@@ -40,13 +43,13 @@ class MazeBatch:
         goals: str | Iterable[CellName] | None = None,
         start: CellName = "random",
         evaluation: bool = False,
-        episode_length: int = 100,
+        episode_length: int | None = None,
         show_walls: bool = False,
         distractors: str | None = None,
         distractor_seed: int = 0,
     ) -> None:
         for name, value in (("num_envs", count), ("episode_length", episode_length)):
-            if value < 1:
+            if value is not None and value < 1:
                 raise UserError(f"{name}={value}: must be at least 1")
         if not SMALLEST_CELL <= cell_pixels <= LARGEST_CELL:
             raise UserError(f"cell_pixels={cell_pixels}: must be from {SMALLEST_CELL} to {LARGEST_CELL}")
@@ -55,7 +58,7 @@ class MazeBatch:
         self.start = None if isinstance(start, str) and start == "random" else cell_of(self.maze, start, "start")
         if self.start is not None and self.start in self.goal_cells:
             raise UserError(f"start={start}: is also a goal, so that an episode would end before it begins")
-        self.episode_length = episode_length
+        self.episode_length = episode_length or round(STEPS_A_CELL * self.maze.cells)
         self.painter = MazePainter(self.maze, cell_pixels, show_walls)
         self._clips: NumberedClips | None = None
         if distractors is not None:

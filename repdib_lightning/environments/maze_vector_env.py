@@ -47,7 +47,7 @@ class MazeVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         goals: str | Iterable[CellName] | None = None,
         start: CellName = "random",
         evaluation: bool = False,
-        episode_length: int = 100,
+        episode_length: int | None = None,
         show_walls: bool = False,
         distractors: str | None = None,
         distractor_seed: int = 0,
