@@ -53,7 +53,7 @@ class PrepareObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
         """Stack the environment's observation: name -> array."""
         given = observation if isinstance(observation, dict) else {next(iter(self._frames)): observation}
         for name, frames in self._frames.items():
-            frame = np.asarray(given[name])
+            frame = np.asarray(given[name], self.encoder_spec.observations[name].dtype)
             frame = np.moveaxis(frame, -1, 0) if name in self._channels_last else frame
             # A copy, since some environments render into the same array again.
             frames.extend([frame.copy()] * (1 if frames else frames.maxlen or 1))

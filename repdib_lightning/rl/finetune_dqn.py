@@ -88,9 +88,7 @@ def finetune_dqn(
     from repdib_lightning.rl.training import Training, report
 
     training = Training(options)
-    if folder.is_dir():
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True)
+    _make(folder)
     training.train(folder)
     return f"{report(training.finish(folder))}    wrote {folder}"
 
@@ -112,6 +110,15 @@ def _check_folder(folder: Path, overwrite: bool) -> None:
         raise UserError(f"--run {folder}: exists already; choose another folder or pass --overwrite")
     if not (folder / CONFIGURATION).is_file():
         raise UserError(f"--run {folder}: is no run of finetune, so --overwrite does not replace it")
+
+
+def _make(folder: Path) -> None:
+    try:
+        if folder.is_dir():
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise UserError(f"--run {folder}: cannot be made ({error.strerror or error})") from error
 
 
 def plain(options: Mapping[str, Any]) -> dict[str, Any]:

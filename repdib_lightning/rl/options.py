@@ -62,5 +62,9 @@ def check_options(options: DQNOptions) -> None:
             raise UserError(f"--{name} must not be negative, is {getattr(options, name)}")
     if options.learning_starts >= options.steps:
         raise UserError(f"--learning_starts {options.learning_starts}: must be below --steps {options.steps}")
+    if options.seed >= 2**32:
+        raise UserError(f"--seed must be below {2**32}, is {options.seed}")
+    if options.n_steps > 1 and not options.frozen:
+        raise UserError(f"--n_steps {options.n_steps}: Stable-Baselines3 keeps longer returns with --frozen only")
     if options.frozen and options.encoder is None:
         raise UserError("--frozen needs --encoder BUNDLE: a fresh encoder that is never trained knows nothing")

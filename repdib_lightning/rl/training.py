@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from stable_baselines3.common.logger import configure
 
 from repdib_lightning.data.files import whole_file
@@ -44,6 +45,7 @@ class Training:
 
     def __init__(self, options: DQNOptions) -> None:
         self.options = options
+        _check_device(options.device)
         bare = open_environment(options.env, options.env_options or {})
         self.maze = maze_of(bare)
         self.visits = CountVisits(bare, self.maze) if self.maze is not None else None
@@ -67,6 +69,10 @@ class Training:
     def _as_encoder_sees(self, environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
         if self.frozen is not None:
             return EncodeObservation(environment, self.frozen)
+        for name, array in self.spec.observations.items():
+            # Stable-Baselines3 takes the smallest side for the channels, and would turn the picture.
+            if array.is_image and array.shape[0] > min(array.shape[1:]):
+                raise UserError(f"'{name}' {array.shape} has more channels than pixels along a side; --frozen takes it")
         return PrepareObservation(environment, self.spec)
 
     def _build_agent(self) -> BottleneckDQN:
@@ -100,6 +106,8 @@ class Training:
                 seed=options.seed,
                 device=options.device,
             )
+        except MemoryError as error:
+            raise UserError(f"--buffer_size {options.buffer_size}: does not fit into memory ({error})") from error
         except RuntimeError as error:
             raise UserError(f"--device {options.device}: {str(error).splitlines()[0]}") from error
         if self.pretrained is not None and self.frozen is None:
@@ -166,7 +174,7 @@ class Training:
         features = self.agent.q_net.features_extractor
         assert isinstance(features, BottleneckFeatures)
         training = {"agent": "dqn", "environment": self.options.env, "steps": self.options.steps}
-        encoder, bottleneck = features.encoder.cpu().eval(), features.bottleneck.cpu().eval()
+        encoder, bottleneck = features.encoder.eval(), features.bottleneck.eval()
         return load_encoder(save_bundle(folder / "bundle", encoder, bottleneck, training=training, data={}))
 
     def _reached(self) -> dict[str, float]:
@@ -185,6 +193,12 @@ class Training:
             found |= {"coverage": covered(self.visits.visits), "entropy": visitation_entropy(self.visits.visits)}
             found["mean_coverage"] = float(self.progress.curve("train/coverage").mean())
         return found
+
+
+def _check_device(name: str) -> None:
+    """Stable-Baselines3 would take the CPU in place of a GPU that is not there, and say nothing."""
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(f"--device {name}: there is no such device (choices: auto, cpu)")
 
 
 def report(outcome: dict[str, Any]) -> str:

@@ -143,6 +143,16 @@ def test_evaluation_holds_every_sample_once_in_equally_many_batches(samples, bat
     assert min(sizes) > 0 and max(sizes) * ranks < batch_size + ranks
 
 
+@pytest.mark.parametrize(("samples", "batch_size", "ranks"), [(19, 8, 2), (24, 8, 2), (50, 12, 3), (33, 8, 4)])
+def test_processes_together_evaluate_on_the_batches_of_one(samples, batch_size, ranks):
+    alone = evaluation_batches(samples, batch_size)
+    shares = [evaluation_batches(samples, batch_size, rank, ranks) for rank in range(ranks)]
+    for whole, *parts in zip(alone, *shares, strict=True):
+        assert sorted(number for part in parts for number in part) == whole
+        assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    assert max(map(len, alone)) <= batch_size and max(map(len, alone)) - min(map(len, alone)) <= 1
+
+
 def test_fewer_held_out_samples_than_processes():
     with pytest.raises(UserError, match="1 samples, too few for 2 processes"):
         evaluation_batches(1, 8, 0, 2)
