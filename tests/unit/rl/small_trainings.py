@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from stable_baselines3.common.logger import Logger
 from torch import Tensor, nn
 
 from repdib_lightning.bottlenecks import RepDIB
@@ -65,7 +66,9 @@ def training(bundle: Path | None, **changes: Any) -> Training:
         "device": "cpu",
     }
     given = defaults | small | changes
-    return Training(DQNOptions(**{name: given[name] for name in DQNOptions.__dataclass_fields__}))
+    made = Training(DQNOptions(**{name: given[name] for name in DQNOptions.__dataclass_fields__}))
+    made.agent.set_logger(Logger(None, []))  # without one, learning makes a folder for its log
+    return made
 
 
 def copied(module: nn.Module) -> dict[str, Tensor]:

@@ -114,6 +114,7 @@ def test_a_saved_policy_needs_no_bundle_and_goes_on_learning(bundle, tmp_path):
     given = {"picture": pictures(40).numpy()}
     actions = [agent.predict(given, deterministic=True)[0] for agent in (run.agent, loaded)]
     np.testing.assert_array_equal(*actions)
+    loaded.set_logger(run.agent.logger)
     before = copied(loaded.q_net_target)
     loaded.learn(10)
     assert "features_extractor.bottleneck.quantiser.book.vectors" in moved(loaded.q_net_target, before)
