@@ -15,6 +15,7 @@ _PACKAGES = (
     "h5py",
     "mujoco",
     "dm_control",
+    "scipy",
     "gymnasium",
     "stable_baselines3",
 )

@@ -51,6 +51,8 @@ class MazeBatch:
         for name, value in (("num_envs", count), ("episode_length", episode_length)):
             if value is not None and value < 1:
                 raise UserError(f"{name}={value}: must be at least 1")
+        if distractor_seed < 0:
+            raise UserError(f"distractor_seed={distractor_seed}: must not be negative")
         if not SMALLEST_CELL <= cell_pixels <= LARGEST_CELL:
             raise UserError(f"cell_pixels={cell_pixels}: must be from {SMALLEST_CELL} to {LARGEST_CELL}")
         self.maze = build_maze(world, size)

@@ -31,7 +31,7 @@ def finetune_dqn(
     learning_starts: int = 500,
     train_freq: int = 1,
     n_steps: int = 1,
-    exploration_fraction: float = 0.3,
+    exploration_fraction: float = 0.6,
     exploration_final_eps: float = 0.05,
     features: int = 128,
     channels: int = 16,
