@@ -21,6 +21,9 @@ COLUMNS = 4
 CROWDED = 4
 """Names under a panel are turned where there are more of them than this."""
 
+WIDEST_TITLE = 40
+"""Characters above a panel; a longer title takes two lines."""
+
 _LINES = ("-", "--", ":")
 HINTS = {"up": " (high is good)", "down": " (low is good)", "": ""}
 
@@ -36,7 +39,8 @@ def seed_points(results: Results, grid: Grid, measures: Sequence[str]) -> bytes 
             values = np.array(list(results.values(setting, measure).values()))
             if len(values):
                 _draw_seeds(panel, place, values, COLOURS[place % len(COLOURS)])
-        panel.set_title(measure + HINTS[direction(measure, results.factors)], fontsize=9)
+        hint = HINTS[direction(measure, results.factors)]
+        panel.set_title(measure + (f"\n{hint.strip()}" if len(measure + hint) > WIDEST_TITLE else hint), fontsize=9)
         panel.set_xticks(range(len(grid.settings)), [setting.name for setting in grid.settings], fontsize=8)
         if crowded:
             panel.tick_params(axis="x", rotation=40)

@@ -96,13 +96,23 @@ def _verdict(results: Results, grid: Grid, claim: Claim) -> Verdict:
     estimate = _estimate(claim, ours, theirs)
     if estimate is None:
         return Verdict(claim, None, None)
-    ends = (estimate.value, estimate.value) if claim.judge == "mean" else (estimate.low, estimate.high)
-    lowest, highest = ends if claim.judge != "any" else ends[::-1]
-    if lowest is None or highest is None:
-        return Verdict(claim, estimate, None)
+    return Verdict(claim, estimate, _holds(claim, estimate))
+
+
+def _holds(claim: Claim, estimate: Estimate) -> bool | None:
+    if claim.judge == "mean":
+        return _keeps(claim, estimate.value, estimate.value)
+    if estimate.low is None or estimate.high is None:
+        return None
+    whole, some = _keeps(claim, estimate.low, estimate.high), _keeps(claim, estimate.high, estimate.low)
+    if claim.judge == "interval":
+        return None if some and not whole else whole
+    return whole if claim.judge == "whole" else some
+
+
+def _keeps(claim: Claim, lowest: float, highest: float) -> bool:
     below = claim.at_most is None or highest <= claim.at_most
-    above = claim.at_least is None or lowest >= claim.at_least
-    return Verdict(claim, estimate, below and above)
+    return below and (claim.at_least is None or lowest >= claim.at_least)
 
 
 def _estimate(claim: Claim, ours: np.ndarray, theirs: np.ndarray) -> Estimate | None:

@@ -131,7 +131,8 @@ class Claim:
         of: ``value`` of the setting, or its ``difference`` from or ``ratio`` to another one (means, seeds in pairs).
         than: that other setting; the baseline by default.
         at_most, at_least: bounds; None for none.
-        judge: whether the ``mean`` must keep the bound, the ``whole`` 95 % interval, or ``any`` of that interval.
+        judge: whether the ``mean`` must keep the bound, the ``whole`` 95 % interval, or ``any`` of that interval; by
+            ``interval`` a claim holds if all of it does, fails if none of it does, and else cannot be told.
     """
 
     text: str

@@ -136,7 +136,7 @@ def _claim(file: Path, text: str, content: Any, grids: Sequence[Grid]) -> Claim:
     if "than" in content:
         check_choice(file, f"{key}.than", content["than"], settings)
     check_choice(file, f"{key}.of", content.get("of", "value"), ("value", "difference", "ratio"))
-    check_choice(file, f"{key}.judge", content.get("judge", "mean"), ("mean", "whole", "any"))
+    check_choice(file, f"{key}.judge", content.get("judge", "mean"), ("mean", "whole", "any", "interval"))
     bounds = [content[bound] for bound in ("at_most", "at_least") if content.get(bound) is not None]
     if not bounds:
         raise UserError(f"{file}: {key} needs at_most or at_least, a number to hold it against")

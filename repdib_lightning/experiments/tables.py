@@ -106,6 +106,9 @@ def difference_table(results: Results, grid: Grid, found: Sequence[Difference], 
     return Table(header, rows)
 
 
+_JUDGED_BY = {"mean": "", "whole": ", whole interval", "any": ", some of it", "interval": ", by the interval"}
+
+
 def claims_table(found: Sequence[Verdict], suite: Suite) -> Table:
     """Each claim, its number, and whether it holds."""
     rows = []
@@ -113,7 +116,7 @@ def claims_table(found: Sequence[Verdict], suite: Suite) -> Table:
         claim = verdict.claim
         bounds = [f"at most {claim.at_most}"] * (claim.at_most is not None)
         bounds += [f"at least {claim.at_least}"] * (claim.at_least is not None)
-        asked = " and ".join(bounds) + {"mean": "", "whole": ", whole interval", "any": ", some of it"}[claim.judge]
+        asked = " and ".join(bounds) + _JUDGED_BY[claim.judge]
         holds = {True: "holds", False: "FAILS", None: "cannot be told"}[verdict.holds]
         grid = suite.grid(claim.grid)
         other = "" if claim.of == "value" else f" against {claim.than or grid.baseline}"
