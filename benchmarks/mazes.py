@@ -48,7 +48,8 @@ def main() -> None:
     }
     took = alternate(contenders, options.rounds, warmup=1)
     print("## Mazes\n")
-    print(f"{machine()}. Median of {options.rounds} rounds in turn: {STEPS} steps of {COUNT} mazes, pictures included.\n")
+    told = f"{STEPS} steps of {COUNT} mazes, pictures included"
+    print(f"{machine()}. Median of {options.rounds} rounds in turn: {told}.\n")
     rows = [[what, 1e6 * took[what] / STEPS, took.ratio(what, "all at once")] for what in contenders]
     print(table(["what", "µs a step of all", "all at once = 1"], rows) + "\n")
     ratio = took.ratio("one after another (gymnasium's sync)", "all at once")
