@@ -161,6 +161,7 @@ def kill_in_save(number: int) -> None:
 
 def train(folder: str, options: dict[str, Any]) -> None:
     """Run or resume (``options["resume"]``) the toy in a run folder, until it ends or is ended."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     torch.set_num_threads(1)
     multiprocessing.set_start_method("fork", force=True)
     run = Path(folder)
