@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from tqdm import tqdm
 
 from repdib_lightning.evaluation.coverage import covered, visitation_entropy
 from repdib_lightning.rl.evaluation import Act, EpisodeEvaluation, MazeEvaluation
@@ -15,10 +17,11 @@ from repdib_lightning.rl.features import BottleneckFeatures
 from repdib_lightning.rl.visits import CountVisits
 
 PROGRESS, POLICY = "progress.csv", "policy.zip"
+_SHOWN = ("eval/return", "eval/success", "train/coverage")
 
 
 class Progress(BaseCallback):
-    """Writes ``progress.csv`` and ``policy.zip`` into a folder.
+    """Writes ``progress.csv`` and ``policy.zip`` into a folder, and moves a bar where there is a terminal.
 
     Columns: ``step``; ``eval/...`` of the evaluation; ``train/coverage`` and ``train/entropy`` of the visits since the
     beginning; ``train/loss`` of the last update; ``train/exploration``; what the bottleneck told of the last update.
@@ -45,7 +48,14 @@ class Progress(BaseCallback):
         self._best: tuple[float, float] | None = None
         self._fields: list[str] = []
 
+    def _on_training_start(self) -> None:
+        self._bar = tqdm(total=self.locals["total_timesteps"], unit=" steps", disable=not sys.stderr.isatty())
+
+    def _on_training_end(self) -> None:
+        self._bar.close()
+
     def _on_step(self) -> bool:
+        self._bar.update()
         if self.num_timesteps % self.every == 0 or self.num_timesteps == self.locals["total_timesteps"]:
             self._add(self._evaluated() | self._trained())
         return True
@@ -76,6 +86,7 @@ class Progress(BaseCallback):
 
     def _add(self, values: dict[str, float]) -> None:
         self.rows.append({"step": self.num_timesteps, **values})
+        self._bar.set_postfix({name: f"{values[name]:.2f}" for name in _SHOWN if name in values})
         new = [name for name in self.rows[-1] if name not in self._fields]
         self._fields += new
         rows = self.rows if new else self.rows[-1:]
