@@ -195,10 +195,16 @@ def _label(axis: str, value: Any) -> str:
     return f"{axis.rpartition('.')[2]}_{value}"
 
 
+_PARTS_OF_FIT = ("checkpoint_every", "checkpoint_keep", CONFIG, "data", "model", "pretrained", "trainer")
+"""What the first word of an option may be."""
+
+
 def _check_options(file: Path, key: str, options: Mapping[Any, Any]) -> None:
     for option in options:
         if not isinstance(option, str):
             raise UserError(f"{file}: {key}: {option!r} is no dotted option of fit, such as model.shift")
+        if option.partition(".")[0] not in _PARTS_OF_FIT and option not in SET_BY_SUITE:
+            raise UserError(f"{file}: {key}: '{option}' is not known {nearest(option, _PARTS_OF_FIT)}")
         if option in SET_BY_SUITE:
             raise UserError(f"{file}: {key}: '{option}' follows from the suite's data and seeds; leave it out")
 

@@ -182,6 +182,10 @@ def finetune(**keys):
         (text(finetune=["dqn"]), "finetune must map names to values"),
         (grid(finetune={"run": {}}), r"unknown key 'grids\.g\.finetune\.run' did you mean 'runs'"),
         (grid(finetune={"with": {"step": 3}}), r"grids\.g\.finetune\.with: 'step' is not known did you mean 'steps'"),
+        (
+            text({"g": {"settings": {"a": {"pretraned": False}}}}),
+            r"grids\.g\.settings\.a: 'pretraned' is not known did you mean 'pretrained'",
+        ),
         (text(show=["scratch"]), r"show: 'scratch' is not pre-trained, it has no latents to show"),
         (text(maps=["scrotch"]), r"maps: 'scrotch' is not known did you mean 'scratch'"),
         (text(finetune_curves="eval/success"), r"finetune_curves must be a list of words"),
