@@ -91,7 +91,7 @@ def collect_maze(
         episode_length: actions an episode.
         seed: of starts, goals, policy and clips.
         goals: cells that an episode's goal is drawn from, such as ``"centre 0,5"``; ``none`` draws no goal. By default
-            the goals of training: the centre and three corners.
+            the goals of training: the four cells in the middle.
         distractors: what plays behind the maze: ``procedural``, ``procedural_images``, a folder of pictures or videos,
             or of CIFAR-10. None: a black floor.
         cell_pixels: height and width of a cell.
