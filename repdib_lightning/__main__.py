@@ -48,7 +48,7 @@ def run(arguments: list[str]) -> int:
         return 0
     verb, rest = arguments[0], arguments[1:]
     if verb not in VERBS:
-        raise UserError(f"unknown verb '{verb}': {nearest(verb, VERBS)}")
+        raise UserError(f"unknown verb '{verb}', {nearest(verb, VERBS)}")
     # Threads that spin long while they wait for each other slow each other down wherever the machine has something else
     # to do. GNU's OpenMP reads this when torch is first imported.
     os.environ.setdefault("GOMP_SPINCOUNT", "5000")

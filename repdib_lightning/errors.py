@@ -15,9 +15,13 @@ class UserError(ValueError):
 
 
 def nearest(word: str, choices: Iterable[str]) -> str:
-    """Return a hint like ``did you mean 'vib'? (choices: none, vib, vq)`` for an unknown word."""
-    listed = sorted(choices)
+    """Return a hint like ``did you mean 'vib'? (choices: none, vib, vq)``, or ``choices: none, vib, vq``.
+
+    It goes on behind a comma: ``unknown head 'x', choices: linear, mlp``. Without choices it is empty.
+    """
+    listed = sorted(set(choices))
     close = difflib.get_close_matches(word, listed, n=1, cutoff=0.5)
-    guess = f"did you mean '{close[0]}'? " if close else ""
-    shown = ", ".join(listed[:12]) + (", ..." if len(listed) > 12 else "")
-    return f"{guess}(choices: {shown})" if listed else guess.strip()
+    shown = "choices: " + ", ".join(listed[:12]) + (", ..." if len(listed) > 12 else "")
+    if close:
+        return f"did you mean '{close[0]}'? ({shown})"
+    return shown if listed else ""

@@ -23,14 +23,14 @@ def one_line(error: BaseException, options: Iterable[str], classes: dict[str, li
     key = _join(keys)
     known = list(options)
     if match := re.search(r"unrecognized arguments: (\S+)", text):
-        return UserError(f"unknown option {match[1]}: {_nearest_option(match[1], known)}")
+        return UserError(f"unknown option {match[1]}, {_nearest_option(match[1], known)}")
     if match := re.search(r"Group '([^']*)' does not accept (?:option|nested key) '([^']+)'", text):
         inside = [name.removeprefix(match[1] + ".") for name in known if name.startswith(match[1] + ".")]
-        return UserError(f"unknown key {match[1]}.{match[2]}: {nearest(match[2], {i.split('.')[0] for i in inside})}")
+        return UserError(f"unknown key {match[1]}.{match[2]}, {nearest(match[2], {i.split('.')[0] for i in inside})}")
     if match := re.search(r"Option '([^']+)' is not accepted", text):
-        return UserError(f"unknown key {key}.{match[1]}: {nearest(match[1], _accepted(text))}")
+        return UserError(f"unknown key {key}.{match[1]}, {nearest(match[1], _accepted(text))}")
     if match := re.search(r"Expected a dot import path string: (\S+)", text):
-        return UserError(f"{key}: unknown class '{match[1]}' {nearest(match[1], classes.get(keys[0], []))}")
+        return UserError(f"{key}: unknown class '{match[1]}', {nearest(match[1], classes.get(keys[0], []))}")
     if match := re.search(r"Expected an? (?:<class ')?([\w.]+)'?>?\. Got value: (.*)", text):
         return UserError(f"{key}: expected {match[1]}, got '{match[2].split(' Got value')[0].strip().rstrip('.')}'")
     plain = re.search(r"Subtypes: \[((?:<class '(?:int|float|str|bool|NoneType)'>(?:, )?)+)\]", text)

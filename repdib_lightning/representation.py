@@ -91,7 +91,7 @@ class RepresentationModule(pl.LightningModule):
         for name in self.named_weights:
             if name not in output.losses:
                 raise UserError(
-                    f"model.loss_weights: no loss is called '{name}' in this run {nearest(name, output.losses)}"
+                    f"model.loss_weights: no loss is called '{name}' in this run, {nearest(name, output.losses)}"
                 )
 
     def configure_optimizers(self) -> Any:

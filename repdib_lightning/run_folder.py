@@ -75,5 +75,7 @@ def existing(folder: Path) -> Path:
     """Return the folder of a run that can go on. Raises UserError with the nearest run otherwise."""
     if not (folder / CONFIGURATION).is_file():
         runs = [str(path.parent) for path in folder.parent.glob(f"*/{CONFIGURATION}")] if folder.parent.is_dir() else []
-        raise UserError(f"{folder}: no such run ({CONFIGURATION} is missing); {nearest(str(folder), runs)}")
+        raise UserError(
+            f"{folder}: no such run ({CONFIGURATION} is missing); {nearest(str(folder), runs) or 'there is none'}"
+        )
     return folder

@@ -131,7 +131,7 @@ def _choose(verb: str, what: str, known: dict[str, str], arguments: list[str]) -
         print(usage, *(f"  {name}" for name in sorted(known)), sep="\n")
         raise SystemExit(0 if arguments else 2)
     if arguments[0] not in known:
-        raise UserError(f"{verb}: unknown {what} '{arguments[0]}': {nearest(arguments[0], known)}")
+        raise UserError(f"{verb}: unknown {what} '{arguments[0]}', {nearest(arguments[0], known)}")
     return arguments[0], arguments[1:]
 
 

@@ -116,13 +116,13 @@ def check_stated(
         demand(isinstance(actions, ActionSpec), f"actions must be an ActionSpec or None, is {type(actions).__name__}")
         demand(
             actions.kind in ("discrete", "continuous"),
-            f"actions: kind is {actions.kind!r} " + _hint(actions.kind, "discrete", "continuous"),
+            f"actions: kind is {actions.kind!r}, " + _hint(actions.kind, "discrete", "continuous"),
         )
         demand(_counts(actions.size), f"actions: size is {actions.size!r}, must be an integer of at least 1")
     for name, factor in factors.items():
         _check_factor(path, name, factor)
     for name, size in masks.items():
-        demand(name in observations, f"'masks/{name}': there is no such observation {nearest(name, observations)}")
+        demand(name in observations, f"'masks/{name}': there is no such observation, {nearest(name, observations)}")
         demand(_is_shape(size) and len(size) == 2, f"'masks/{name}' must be (height, width), is {size!r}")
 
 
@@ -134,9 +134,9 @@ def _check_factor(path: Path, name: str, factor: FactorSpec) -> None:
     if not isinstance(factor, FactorSpec):
         raise UserError(f"{key} must be a FactorSpec, is {type(factor).__name__}")
     if factor.kind not in ("endogenous", "exogenous"):
-        raise UserError(f"{key}: kind is {factor.kind!r} {_hint(factor.kind, 'endogenous', 'exogenous')}")
+        raise UserError(f"{key}: kind is {factor.kind!r}, {_hint(factor.kind, 'endogenous', 'exogenous')}")
     if factor.scale not in ("categorical", "continuous"):
-        raise UserError(f"{key}: scale is {factor.scale!r} {_hint(factor.scale, 'categorical', 'continuous')}")
+        raise UserError(f"{key}: scale is {factor.scale!r}, {_hint(factor.scale, 'categorical', 'continuous')}")
     if not _counts(factor.width) or (factor.scale == "categorical" and factor.width != 1):
         raise UserError(f"{key}: width is {factor.width!r}, must be 1 (categorical) or an integer of at least 1")
     if factor.scale == "categorical" and not _counts(factor.classes):
@@ -186,7 +186,7 @@ def check_episode(where: str, columns: dict[str, Column], given: dict[str, Any])
     """
     for key in given:
         if key not in columns:
-            raise UserError(f"{where}: the writer was made without '{key}' {nearest(key, columns)}")
+            raise UserError(f"{where}: the writer was made without '{key}', {nearest(key, columns)}")
     for key, column in columns.items():
         if key not in given:
             raise UserError(f"{where}: '{key}' is missing; expected {column.expected()}")

@@ -64,7 +64,7 @@ class EpisodeStore:
         if not self.path.is_file():
             folder = self.path.parent
             there = [p.name for p in folder.glob("*.h5")] if folder.is_dir() else []
-            raise UserError(f"{self.path}: no such data file {nearest(self.path.name, there)}".rstrip())
+            raise UserError(f"{self.path}: no such data file, {nearest(self.path.name, there)}".rstrip(", "))
         try:
             return h5py.File(self.path, "r")
         except OSError as error:
@@ -123,7 +123,7 @@ class EpisodeStore:
             UserError: the store has no such key.
         """
         if name not in self._places:
-            raise UserError(f"{self.path}: has no key '{name}' {nearest(name, self._places)}")
+            raise UserError(f"{self.path}: has no key '{name}', {nearest(name, self._places)}")
         if name not in self._maps:
             offset, shape, dtype = self._places[name]
             wanted = self._dtype_in_memory(name, dtype)

@@ -153,7 +153,7 @@ def action_spec(path: Path, file: h5py.File, starts: np.ndarray, lengths: np.nda
     kind = attribute(data, "kind", "discrete" if integers else "continuous")
     if kind not in ("discrete", "continuous"):
         choices = ("discrete", "continuous")
-        raise UserError(f"{path}: attribute kind of 'actions' is {kind!r} {nearest(str(kind), choices)}")
+        raise UserError(f"{path}: attribute kind of 'actions' is {kind!r}, {nearest(str(kind), choices)}")
     if kind == "discrete" and (not integers or data.ndim != 1):
         raise UserError(f"{path}: discrete 'actions' must be (N,) integers, are {_describe(data)}")
     if kind == "continuous" and (data.dtype.kind not in "fiu" or data.ndim != 2 or data.shape[1] == 0):
@@ -193,7 +193,7 @@ def factor_spec(path: Path, name: str, data: h5py.Dataset) -> FactorSpec:
     scale = attribute(data, "scale", "categorical" if integers else "continuous")
     if scale not in ("categorical", "continuous"):
         choices = ("categorical", "continuous")
-        raise UserError(f"{path}: attribute scale of {key} is {scale!r} {nearest(str(scale), choices)}")
+        raise UserError(f"{path}: attribute scale of {key} is {scale!r}, {nearest(str(scale), choices)}")
     width = data.shape[1] if data.ndim == 2 else 1
     if scale == "continuous":
         return FactorSpec(kind, scale, 0, width)
@@ -210,7 +210,7 @@ def mask_width(path: Path, name: str, data: h5py.Dataset, observations: dict[str
     """W of a bit-packed mask. Raises UserError if it belongs to no observation or is not packed as it says."""
     key = f"'masks/{name}'"
     if name not in observations:
-        raise UserError(f"{path}: {key} is the mask of no observation {nearest(name, observations)}")
+        raise UserError(f"{path}: {key} is the mask of no observation, {nearest(name, observations)}")
     if "width" not in data.attrs:
         raise UserError(f"{path}: {key} needs an attribute width: the pixels of a row before they were packed")
     width = _whole_number(path, key, data, "width", 0, least=1)

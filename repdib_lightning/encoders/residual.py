@@ -45,10 +45,10 @@ class ResNetEncoder(Encoder):
         self.views = views
         if architecture not in _ARCHITECTURES:
             raise UserError(
-                f"ResNetEncoder: unknown architecture '{architecture}' {nearest(architecture, _ARCHITECTURES)}"
+                f"ResNetEncoder: unknown architecture '{architecture}', {nearest(architecture, _ARCHITECTURES)}"
             )
         if norm not in ("batch", "group"):
-            raise UserError(f"ResNetEncoder: unknown norm '{norm}' {nearest(norm, ('batch', 'group'))}")
+            raise UserError(f"ResNetEncoder: unknown norm '{norm}', {nearest(norm, ('batch', 'group'))}")
         self.networks = nn.ModuleDict()
         width = 0
         for view in self.views:

@@ -20,7 +20,7 @@ def image_views(spec: DataSpec, views: list[str] | None, owner: str) -> list[str
     images = [name for name, array in spec.observations.items() if array.is_image]
     for name in views or []:
         if name not in images:
-            raise UserError(f"{owner}: views has '{name}', which is no picture in the data {nearest(name, images)}")
+            raise UserError(f"{owner}: views has '{name}', which is no picture in the data, {nearest(name, images)}")
     chosen = views if views is not None else images
     if not chosen:
         raise UserError(f"{owner}: needs at least one picture (C, H, W); pictures in the data: {images or 'none'}")

@@ -108,7 +108,7 @@ def build_maze(name: str, size: int = 6) -> Maze:
         UserError: an unknown world, or a size out of range.
     """
     if name not in WORLDS:
-        raise UserError(f"unknown maze '{name}' {nearest(name, WORLDS)}")
+        raise UserError(f"unknown maze '{name}', {nearest(name, WORLDS)}")
     if not SMALLEST <= size <= LARGEST:
         raise UserError(f"size={size}: a maze has {SMALLEST} to {LARGEST} cells along each side")
     touching = {(cell, cell + step) for cell in range(size**2) for step in _to_right_and_below(cell, size)}

@@ -53,7 +53,7 @@ def check_compatible(encoder: Encodes, store: EpisodeStore, bundle: str = "the e
     for name, wanted in encoder.spec.observations.items():
         if name not in store.observations:
             raise UserError(
-                f"{store.path}: has no observation '{name}', which {bundle} was trained on "
+                f"{store.path}: has no observation '{name}', which {bundle} was trained on, "
                 f"{nearest(name, store.observations)}"
             )
         held = stacked(store.observations[name], encoder.spec.frame_stack)
@@ -120,5 +120,5 @@ def resolve_device(device: str) -> torch.device:
         torch.empty(1, device=chosen)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         choices = ["auto", "cpu"] + (["cuda"] if torch.cuda.is_available() else [])
-        raise UserError(f"device '{device}' cannot be used here {nearest(device, choices)}") from error
+        raise UserError(f"device '{device}' cannot be used here, {nearest(device, choices)}") from error
     return chosen

@@ -92,7 +92,7 @@ def check_probes(probes: tuple[str, ...]) -> None:
         if name not in (*PROBES, DECODER):
             raise UserError(f"probes: unknown probe '{name}', {nearest(name, (*PROBES, DECODER))}")
     if not set(probes) & set(PROBES):
-        raise UserError(f"probes: at least one of the factors is needed {nearest('', PROBES)}")
+        raise UserError(f"probes: at least one of the factors is needed, {nearest('', PROBES)}")
 
 
 def as_target(values: np.ndarray, spec: FactorSpec) -> np.ndarray:

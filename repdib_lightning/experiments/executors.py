@@ -86,7 +86,7 @@ def build_executor(name: str, folder: Path, jobs: int | None, threads: int, slur
             :class:`~repdib_lightning.experiments.slurm.SlurmExecutor` complains of.
     """
     if name not in EXECUTORS:
-        raise UserError(f"--executor: unknown '{name}': {nearest(name, EXECUTORS)}")
+        raise UserError(f"--executor: unknown '{name}', {nearest(name, EXECUTORS)}")
     if jobs is not None and jobs < 1:
         raise UserError(f"--jobs must be at least 1, is {jobs}")
     if name == "local":

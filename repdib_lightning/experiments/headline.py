@@ -124,4 +124,4 @@ def _estimate(claim: Claim, ours: np.ndarray, theirs: np.ndarray) -> Estimate | 
 def _check_measure(results: Results, grid: Grid, measure: str, key: str) -> None:
     known = results.measures(grid)
     if measure not in known:
-        raise UserError(f"{results.suite.file}: {key}: no point has the measure '{measure}' {nearest(measure, known)}")
+        raise UserError(f"{results.suite.file}: {key}: no point has the measure '{measure}', {nearest(measure, known)}")

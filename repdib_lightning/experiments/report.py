@@ -119,7 +119,7 @@ def table_measures(results: Results, grid: Grid) -> list[str]:
     means = [name for name in kept if name.split("/")[1] in ("state", "noise")]
     for name in results.suite.measures:
         if name not in anywhere:
-            raise UserError(f"{results.suite.file}: measures: no point has '{name}' {nearest(name, anywhere)}")
+            raise UserError(f"{results.suite.file}: measures: no point has '{name}', {nearest(name, anywhere)}")
     chosen = [name for name in results.suite.measures if name in known]
     codes = [name for name in known if name.startswith("codes/")]
     return [*means, *[name for name in kept if name not in means], *chosen, *codes]
@@ -161,7 +161,8 @@ def _latent_parts(results: Results) -> list[Part]:
     for factor in results.suite.colours:
         if factor not in results.factors:
             raise UserError(
-                f"{results.suite.file}: colours: no factor is called '{factor}' {nearest(factor, results.factors)}"
+                f"{results.suite.file}: colours: no factor is called '{factor}', "
+                f"{nearest(factor, results.factors) or 'the data have none'}"
             )
         colours[factor] = results.factors[factor]
     drawings = {name: part.drawings for name, part in samples.items() if part.drawings is not None}

@@ -64,7 +64,7 @@ def run_suite(
     points = chosen_points(plan, tune=tune, seeds=seeds, only=only, runs=runs)
     known = [phase for phase in PHASES if any(phase in point.setting.phases for point in points)]
     if redo and redo not in known:
-        raise UserError(f"--redo: no phase is called '{redo}' {nearest(redo, known)}")
+        raise UserError(f"--redo: no phase is called '{redo}', {nearest(redo, known)}")
     chosen = build_executor(executor, runs / plan.name, jobs, plan.threads, plan.slurm)
     unfinished = ("waiting", "stopped", "failed")
     redone = {point.name for point in points if redo in point.setting.phases}
@@ -122,7 +122,7 @@ def _places(plan: Suite, wanted: Sequence[str]) -> list[str]:
             found.setdefault(name, []).append(plan.run_by(setting).place)
     for word in wanted:
         if word not in found:
-            raise UserError(f"--only: no setting or grid is called '{word}' {nearest(word, found)}")
+            raise UserError(f"--only: no setting or grid is called '{word}', {nearest(word, found)}")
     return [place for word in wanted for place in found[word]]
 
 

@@ -46,7 +46,7 @@ class SlurmExecutor:
         known = common | {f"slurm_{name}" for name in common | submitit.SlurmExecutor._valid_parameters()}
         for name in parameters:
             if name not in known:
-                raise UserError(f"suite's slurm parameters: unknown '{name}' {nearest(name, known)}")
+                raise UserError(f"suite's slurm parameters: unknown '{name}', {nearest(name, known)}")
         chosen: dict[str, Any] = {"name": "repdib", "timeout_min": 240, "cpus_per_task": threads, **parameters}
         if jobs is not None:
             chosen["slurm_array_parallelism"] = jobs

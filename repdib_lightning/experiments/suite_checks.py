@@ -37,7 +37,7 @@ def words(file: Path, key: str, value: Any, choices: Sequence[str] | None = None
 def check_choice(file: Path, key: str, word: Any, choices: Sequence[str]) -> None:
     """One of the choices."""
     if word not in choices:
-        raise UserError(f"{file}: {key}: '{word}' is not known {nearest(str(word), choices)}")
+        raise UserError(f"{file}: {key}: '{word}' is not known, {nearest(str(word), choices)}")
 
 
 def check_number(file: Path, key: str, value: Any) -> None:
@@ -53,7 +53,7 @@ def check_keys(file: Path, where: str, tree: Any, known: set[str]) -> dict[str, 
     for key in tree:
         if key not in known:
             full = f"{where}.{key}" if where else str(key)
-            raise UserError(f"{file}: unknown key '{full}' {nearest(str(key), known)}")
+            raise UserError(f"{file}: unknown key '{full}', {nearest(str(key), known)}")
     return tree
 
 

@@ -65,7 +65,7 @@ def read_grid(file: Path, name: str, content: Any, common: Common) -> Grid:
     names = [setting.name for setting in settings]
     baseline = str(content.get("baseline", names[0]))
     if baseline not in names:
-        raise UserError(f"{file}: {key}.baseline: no setting is called '{baseline}' {nearest(baseline, names)}")
+        raise UserError(f"{file}: {key}.baseline: no setting is called '{baseline}', {nearest(baseline, names)}")
     return Grid(name, str(content.get("about", "")), baseline, tuple(settings), own.data, own.collect)
 
 
@@ -204,7 +204,7 @@ def _check_options(file: Path, key: str, options: Mapping[Any, Any]) -> None:
         if not isinstance(option, str):
             raise UserError(f"{file}: {key}: {option!r} is no dotted option of fit, such as model.shift")
         if option.partition(".")[0] not in _PARTS_OF_FIT and option not in SET_BY_SUITE:
-            raise UserError(f"{file}: {key}: '{option}' is not known {nearest(option, _PARTS_OF_FIT)}")
+            raise UserError(f"{file}: {key}: '{option}' is not known, {nearest(option, _PARTS_OF_FIT)}")
         if option in SET_BY_SUITE:
             raise UserError(f"{file}: {key}: '{option}' follows from the suite's data and seeds; leave it out")
 

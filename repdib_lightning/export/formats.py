@@ -49,7 +49,7 @@ def check_formats(formats: Sequence[str]) -> None:
     """
     for name in formats:
         if name not in _NEEDED_PACKAGES:
-            raise UserError(f"unknown export format '{name}' {nearest(name, _NEEDED_PACKAGES)}")
+            raise UserError(f"unknown export format '{name}', {nearest(name, _NEEDED_PACKAGES)}")
         missing = [package for package in _NEEDED_PACKAGES[name] if importlib.util.find_spec(package) is None]
         if missing:
             raise UserError(f"format '{name}' needs {' and '.join(missing)}: pip install {' '.join(missing)}")

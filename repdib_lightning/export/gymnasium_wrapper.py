@@ -67,7 +67,7 @@ class PrepareObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
             return {names[0]: space}
         for name in names:
             if name not in space.spaces:
-                raise UserError(f"the environment gives no observation '{name}' {nearest(name, space.spaces)}")
+                raise UserError(f"the environment gives no observation '{name}', {nearest(name, space.spaces)}")
         return dict(space.spaces)
 
 

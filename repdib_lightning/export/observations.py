@@ -45,7 +45,7 @@ def _named(given: Observations, spec: DataSpec) -> Mapping[str, Array]:
         return {names[0]: given}
     for name in given:
         if name not in spec.observations:
-            raise UserError(f"observation '{name}' is unknown to the encoder {nearest(str(name), names)}")
+            raise UserError(f"observation '{name}' is unknown to the encoder, {nearest(str(name), names)}")
     for name in names:
         if name not in given:
             raise UserError(f"observation '{name}' is missing (given: {', '.join(map(str, given)) or 'none'})")

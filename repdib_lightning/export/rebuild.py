@@ -127,11 +127,13 @@ def _build(path: Path, key: str, config: Mapping[str, Any], allowed: Mapping[str
     name = _value(path, config[key], "class", str, f"{key}.")
     arguments = _value(path, config[key], "arguments", dict, f"{key}.")
     if name not in allowed:
-        raise UserError(f"{path}: '{key}.class' is unknown: '{name}' {nearest(name, allowed)}")
+        raise UserError(f"{path}: '{key}.class' is unknown: '{name}', {nearest(name, allowed)}")
     taken = list(inspect.signature(allowed[name]).parameters)[1:]
     for argument in arguments:
         if argument not in taken:
-            raise UserError(f"{path}: '{key}.arguments' has '{argument}', unknown to {name} {nearest(argument, taken)}")
+            raise UserError(
+                f"{path}: '{key}.arguments' has '{argument}', unknown to {name}; {nearest(argument, taken)}"
+            )
     try:
         return allowed[name](first, **arguments)
     # Values of a wrong type fail in ways that only the class knows; all of them are the file's fault.

@@ -23,7 +23,7 @@ def open_environment(name: str, options: Mapping[str, Any]) -> gymnasium.Env[Any
     short = {known.removeprefix("repdib/").partition("-")[0]: known for known in GYMNASIUM_IDS}
     wanted = short.get(name, name)
     if wanted not in gymnasium.registry:
-        raise UserError(f"--env {name}: no such environment {nearest(name, [*short, *_alike(name)])}")
+        raise UserError(f"--env {name}: no such environment, {nearest(name, [*short, *_alike(name)])}")
     if wanted in GYMNASIUM_IDS:
         _check_options(name, GYMNASIUM_IDS[wanted], options)
     try:
@@ -51,7 +51,7 @@ def _check_options(name: str, place: str, options: Mapping[str, Any]) -> None:
     known = [option for option in kinds if option not in ("world", "render_mode", "return")]
     for option, value in options.items():
         if option not in known:
-            raise UserError(f"--env_options.{option}: no option of {name} {nearest(option, known)}")
+            raise UserError(f"--env_options.{option}: no option of {name}, {nearest(option, known)}")
         allowed = get_args(kinds[option]) or (kinds[option],)
         if {*allowed} <= {int, bool, str, type(None)} and type(value) not in allowed:
             wanted = " or ".join(kind.__name__ for kind in allowed if kind is not type(None))

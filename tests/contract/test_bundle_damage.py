@@ -110,10 +110,10 @@ def test_another_layout_of_the_same_content_is_no_damage(bundle: Path, intact: P
 CHANGES: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda c: c["encoder"].update({"class": "ConvolutionEncoder"}), "did you mean 'ConvolutionalEncoder'?"),
     (lambda c: c["encoder"].update({"class": "os.system"}), "'encoder.class' is unknown: 'os.system'"),
-    (lambda c: c["bottleneck"].update({"class": "Repdib"}), "'bottleneck.class' is unknown: 'Repdib' did you mean"),
+    (lambda c: c["bottleneck"].update({"class": "Repdib"}), "'bottleneck.class' is unknown: 'Repdib', did you mean"),
     (lambda c: c["bottleneck"].pop("class"), "key 'bottleneck.class' is missing"),
     (lambda c: c["encoder"].pop("arguments"), "key 'encoder.arguments' is missing"),
-    (lambda c: c["encoder"]["arguments"].update(chanels=3), "'chanels', unknown to ConvolutionalEncoder did you mean"),
+    (lambda c: c["encoder"]["arguments"].update(chanels=3), "'chanels', unknown to ConvolutionalEncoder; did you mean"),
     (lambda c: c["encoder"]["arguments"].update(spec=3), "'encoder.arguments' has 'spec'"),
     (lambda c: c["encoder"]["arguments"].update(self=3), "'encoder.arguments' has 'self'"),
     (lambda c: c["encoder"]["arguments"].update(features="8"), "'encoder.arguments' do not build"),

@@ -47,17 +47,17 @@ def fit(*options: str) -> list[str]:
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        (["fti"], "unknown verb 'fti': did you mean 'fit'?"),
+        (["fti"], "unknown verb 'fti', did you mean 'fit'?"),
         (["fit", "--config", "robot_amr"], "--config robot_amr: no such file or packaged configuration; did you mean"),
-        (fit("--model.shfit", "1"), "unknown option --model.shfit: did you mean '--model.shift'?"),
-        (fit("--trainer.max_epoch", "3"), "unknown option --trainer.max_epoch: did you mean '--trainer.max_epochs'?"),
-        (fit("--model.encoder.init_args.featurs", "8"), "model.encoder.featurs: did you mean 'features'?"),
+        (fit("--model.shfit", "1"), "unknown option --model.shfit, did you mean '--model.shift'?"),
+        (fit("--trainer.max_epoch", "3"), "unknown option --trainer.max_epoch, did you mean '--trainer.max_epochs'?"),
+        (fit("--model.encoder.init_args.featurs", "8"), "model.encoder.featurs, did you mean 'features'?"),
         (fit("--model.encoder.init_args.features", "many"), "model.encoder.features: expected int, got 'many'"),
         (fit("--data.init_args.batch_size", "x"), "data.batch_size: expected int, got 'x'"),
-        (fit("--model.bottleneck", "RepDB"), "model.bottleneck: unknown class 'RepDB' did you mean 'RepDIB'?"),
+        (fit("--model.bottleneck", "RepDB"), "model.bottleneck: unknown class 'RepDB', did you mean 'RepDIB'?"),
         (fit("--model.bottleneck.init_args.groups", "7"), "groups 7 does not divide the width 128 (nearest: 4 or 8)"),
         (fit("--data.init_args.batch_size", "-3"), "data.batch_size must be at least 1, is -3"),
-        (fit("--model.loss_weights", "{kll: 1.0}"), "no loss is called 'kll' in this run did you mean 'kl'?"),
+        (fit("--model.loss_weights", "{kll: 1.0}"), "no loss is called 'kll' in this run, did you mean 'kl'?"),
         (fit("--data.init_args.views", "[frnt]"), "small.h5: has no observation 'frnt' did you mean 'front'?"),
         (fit("--data.horizon", "30"), "episode 0 has 12 steps, fewer than the horizon 30"),
         (fit("--checkpoint_every", "0"), "checkpoint_every"),
@@ -76,10 +76,10 @@ def fit(*options: str) -> list[str]:
         (["fit", "--resume", "runs/none"], "runs/none: no such run"),
         (["fit", "--resume"], "--resume: needs the folder of a run"),
         (["validate"], "validate: needs the folder of a run"),
-        (["collect", "robot_amr", "x.h5"], "collect: unknown environment 'robot_amr': did you mean 'robot_arm'?"),
+        (["collect", "robot_amr", "x.h5"], "collect: unknown environment 'robot_amr', did you mean 'robot_arm'?"),
         (["collect", "robot_arm", "x.h5", "--samples", "-5"], "samples"),
         (["collect", "robot_arm", "small.h5"], "small.h5: exists already"),
-        (["import", "vdrl", "a", "b"], "import: unknown format 'vdrl': did you mean 'vd4rl'?"),
+        (["import", "vdrl", "a", "b"], "import: unknown format 'vdrl', did you mean 'vd4rl'?"),
         (["import", "vd4rl", "nowhere", "b.h5"], "nowhere"),
         (["inspect", "smal.h5"], "smal.h5: no such"),
         (["export", "runs/none"], "runs/none: no such run folder"),
@@ -101,7 +101,7 @@ def test_one_line(here, capsys, arguments, wanted):
 
 def test_yaml_with_an_unknown_key_and_broken_yaml(here, capsys):
     Path("typo.yaml").write_text("model:\n  shfit: 3\n")
-    assert "unknown key model.shfit: did you mean 'shift'?" in complaint(
+    assert "unknown key model.shfit, did you mean 'shift'?" in complaint(
         capsys, "fit", "--config", "robot_arm", "--config", "typo.yaml"
     )
     Path("broken.yaml").write_text("model: [\n")

@@ -314,17 +314,17 @@ def test_settings_that_share_a_run_are_found_under_either_name(here):
 @pytest.mark.parametrize(
     ("words", "wanted"),
     [
-        (["--executor", "slrum"], "--executor: unknown 'slrum': did you mean 'slurm'?"),
+        (["--executor", "slrum"], "--executor: unknown 'slrum', did you mean 'slurm'?"),
         (["--jobs", "0"], "--jobs must be at least 1, is 0"),
         (["--jobs", "many"], "jobs: expected int, got 'many'"),
-        (["--only", "non"], "--only: no setting or grid is called 'non' did you mean 'none'?"),
+        (["--only", "non"], "--only: no setting or grid is called 'non', did you mean 'none'?"),
         (["--only", ","], "--only: expected a word"),
         (["--seeds", "0", "--tune"], "--seeds: seed 0 is for reporting only"),
         (["--seeds", "100"], "--seeds: seed 100 is for development"),
         (["--seeds=-1"], "--seeds: must be at least 0, is -1"),
         (["--seeds", "one"], "--seeds: expected numbers between commas, got 'one'"),
-        (["--redo", "prob"], "--redo: no phase is called 'prob' did you mean 'probe'?"),
-        (["--redoo", "probe"], "unknown option --redoo: did you mean '--redo'?"),
+        (["--redo", "prob"], "--redo: no phase is called 'prob', did you mean 'probe'?"),
+        (["--redoo", "probe"], "unknown option --redoo, did you mean '--redo'?"),
     ],
 )
 def test_bad_options(here, capsys, words, wanted):
@@ -334,7 +334,7 @@ def test_bad_options(here, capsys, words, wanted):
 def test_an_unknown_suite_and_a_missing_store(here, capsys):
     complaint(capsys, ["run", "tow.yaml"], "suite tow.yaml: no such file or packaged suite")
     complaint(capsys, ["status", "robot_amr"], "did you mean 'robot_arm'?")
-    complaint(capsys, ["rum", "two.yaml"], "unknown verb 'rum': did you mean 'run'?")
+    complaint(capsys, ["rum", "two.yaml"], "unknown verb 'rum', did you mean 'run'?")
     Path("small.h5").unlink()
     complaint(capsys, ["run", "two.yaml"], "small.h5")
 

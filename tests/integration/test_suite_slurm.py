@@ -196,8 +196,8 @@ def test_redo_in_the_queue(here, capsys):
 @pytest.mark.parametrize(
     ("parameter", "wanted"),
     [
-        ("slurm_partitio: x", "suite's slurm parameters: unknown 'slurm_partitio' did you mean 'slurm_partition'?"),
-        ("partition: x", "suite's slurm parameters: unknown 'partition' did you mean 'slurm_partition'?"),
+        ("slurm_partitio: x", "suite's slurm parameters: unknown 'slurm_partitio', did you mean 'slurm_partition'?"),
+        ("partition: x", "suite's slurm parameters: unknown 'partition', did you mean 'slurm_partition'?"),
         ("timeout_min: long", 'suite\'s slurm parameters: Parameter "timeout_min" expected type'),
     ],
 )

@@ -104,7 +104,7 @@ def _find_table(source: Path, table: str | None) -> Path:
     found = sorted(file.name for file in source.glob("*.csv"))
     if table is not None:
         if table not in found:
-            raise UserError(f"{source / table}: no such CSV file {nearest(table, found)}".rstrip())
+            raise UserError(f"{source / table}: no such CSV file, {nearest(table, found)}".rstrip(", "))
         return source / table
     if "run.csv" in found or len(found) == 1:
         return source / ("run.csv" if "run.csv" in found else found[0])

@@ -36,7 +36,7 @@ class Table:
             UserError: no such column; names the option that asked for it and the columns that exist.
         """
         if name not in self.columns:
-            raise UserError(f"{self.path}: {option}: no column '{name}' {nearest(name, self.columns)}")
+            raise UserError(f"{self.path}: {option}: no column '{name}', {nearest(name, self.columns)}")
         return self.columns[name]
 
     def is_number(self, name: str) -> bool:

@@ -141,7 +141,7 @@ def test_files_that_are_no_stores(store_file, content):
 
 
 def test_a_missing_file_names_the_nearest(store_file):
-    with pytest.raises(UserError, match=r"no such data file did you mean 'small\.h5'"):
+    with pytest.raises(UserError, match=r"no such data file, did you mean 'small\.h5'"):
         EpisodeStore(store_file.with_name("smal.h5"))
 
 

@@ -225,7 +225,7 @@ def test_render_is_for_people():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"world": "Grid"}, r"unknown maze 'Grid' did you mean 'GridWorld'"),
+        ({"world": "Grid"}, r"unknown maze 'Grid', did you mean 'GridWorld'"),
         ({"goals": "6,2"}, r"goals=6,2: lies outside of GridWorld.* nearest is 5,2"),
         ({"goals": "centre 2.5,2"}, r"goals=2.5,2: lies in a wall .* nearest is 2,2"),
         ({"goals": "inf,-1"}, r"goals=inf,-1: lies outside .* nearest is 5,0"),

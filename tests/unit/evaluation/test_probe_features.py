@@ -53,7 +53,7 @@ def test_a_wrong_shape_names_bundle_data_and_both_shapes(store):
 def test_a_missing_observation_names_the_nearest(store):
     encoder = cell_encoder()
     encoder.spec = DataSpec({"frond": ArraySpec((3, 16, 16))})
-    with pytest.raises(UserError, match=r"no observation 'frond', which runs/x was trained on did you mean 'front'"):
+    with pytest.raises(UserError, match=r"no observation 'frond', which runs/x was trained on, did you mean 'front'"):
         check_compatible(encoder, store, "runs/x")
 
 

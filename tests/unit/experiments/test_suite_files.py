@@ -175,7 +175,7 @@ def grid(**keys):
         ("a: [1\nb: 2", "not valid YAML"),
         ("when: 2024-13-45\n", "not valid YAML"),
         ("a: \x00", "not valid YAML"),
-        (changed(seed=[1]), r"unknown key 'seed' did you mean 'seeds'"),
+        (changed(seed=[1]), r"unknown key 'seed', did you mean 'seeds'"),
         (changed(base="REMOVED"), "'base' is missing"),
         (changed(data="REMOVED"), "'data' is missing"),
         (changed(grids="REMOVED"), "'grids' is missing"),
@@ -196,7 +196,7 @@ def grid(**keys):
         (changed(seeds=[True]), "seeds must be a list of seeds"),
         (changed(seeds=["0"]), "seeds must be a list of seeds"),
         (changed(probe=["linear"]), "probe must map keys to values"),
-        (changed(probe={"probs": "linear"}), r"unknown key 'probe\.probs' did you mean 'probes'"),
+        (changed(probe={"probs": "linear"}), r"unknown key 'probe\.probs', did you mean 'probes'"),
         (changed(slurm="gpu"), "slurm must map names to values"),
         (changed(headline=["state"]), "headline must map names to values"),
         (changed(grids={}), "grids must map names to grids"),
@@ -224,8 +224,8 @@ def grid(**keys):
         (grid(**{"with": [1]}), r"grids\.bottleneck\.with must map names to values"),
         (grid(**{"with": {"config": "bottleneck/repdab"}}), r"grids\.bottleneck: bottleneck/repdab: .*did you mean"),
         (grid(vary={"config": ["bottleneck/non"]}), r"bottleneck/non: no such file.*did you mean 'bottleneck/none'"),
-        (grid(baseline="nome"), r"grids\.bottleneck\.baseline: no setting is called 'nome' did you mean 'none'"),
-        (grid(base="none"), r"unknown key 'grids\.bottleneck\.base' did you mean 'baseline'"),
+        (grid(baseline="nome"), r"grids\.bottleneck\.baseline: no setting is called 'nome', did you mean 'none'"),
+        (grid(base="none"), r"unknown key 'grids\.bottleneck\.base', did you mean 'baseline'"),
     ],
 )
 def test_every_mistake_is_one_line_that_names_the_file_and_the_key(tmp_path, text, said):

@@ -220,9 +220,9 @@ def test_runs_on_other_data_are_not_compared(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("[val/raw/inverse]", "[val/raw/inverze]", "measures: no point has 'val/raw/inverze' did you mean"),
+        ("[val/raw/inverse]", "[val/raw/inverze]", "measures: no point has 'val/raw/inverze', did you mean"),
         ("measure: linear/time", "measure: linear/tine", "headline.time: no point has the measure 'linear/tine/error'"),
-        ("colours: [cell, time]", "colours: [cell, tine]", "colours: no factor is called 'tine' did you mean 'time'"),
+        ("colours: [cell, time]", "colours: [cell, tine]", "colours: no factor is called 'tine', did you mean 'time'"),
         ("claims: {}", "claims: {it works: {setting: vq, measure: linear/noice/kept, at_most: 1}}", "claims.it works"),
     ],
 )

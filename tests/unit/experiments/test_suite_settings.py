@@ -118,9 +118,9 @@ def test_a_claim_is_about_the_settings_of_its_grid(tmp_path):
     claim = {"setting": "own", "measure": "dqn/Spiral/success", "at_least": 0.5}
     suite = read(tmp_path, {"g": GRID, "later": LATER}, claims={"it works": {**claim, "grid": "later"}})
     assert suite.claims[0].grid == "later" and suite.grid("later").settings[0].name == "own"
-    with pytest.raises(UserError, match=r"claims\.it works\.setting: 'own' is not known \(choices: none, scratch\)"):
+    with pytest.raises(UserError, match=r"claims\.it works\.setting: 'own' is not known, choices: none, scratch"):
         read(tmp_path, {"g": GRID, "later": LATER}, claims={"it works": claim})
-    with pytest.raises(UserError, match=r"claims\.it works\.grid: 'latter' is not known did you mean 'later'"):
+    with pytest.raises(UserError, match=r"claims\.it works\.grid: 'latter' is not known, did you mean 'later'"):
         read(tmp_path, {"g": GRID, "later": LATER}, claims={"it works": {**claim, "grid": "latter"}})
 
 
@@ -149,7 +149,7 @@ def finetune(**keys):
     ("content", "said"),
     [
         (grid(vary={"model.shift": [1]}), r"grids\.g has both 'vary' and 'settings'"),
-        (grid(setting={}), r"unknown key 'grids\.g\.setting' did you mean 'settings'"),
+        (grid(setting={}), r"unknown key 'grids\.g\.setting', did you mean 'settings'"),
         (grid(settings=["none"]), r"grids\.g\.settings must map names to settings"),
         (grid(settings={}), r"grids\.g\.settings must map names to settings"),
         (grid(data=3), r"grids\.g\.data must name a store"),
@@ -168,26 +168,29 @@ def finetune(**keys):
             text({"g": GRID, "h": {**LATER, "data": "data/a.h5", "collect": "other"}}, collect="maze"),
             r"grids\.h\.collect: data/a\.h5 is made by 'maze' for grid 'g'",
         ),
-        (finetune(agents="dqn"), r"unknown key 'finetune\.agents' did you mean 'agent'"),
-        (finetune(agent="dqm"), r"finetune\.agent: 'dqm' is not known did you mean 'dqn'"),
+        (finetune(agents="dqn"), r"unknown key 'finetune\.agents', did you mean 'agent'"),
+        (finetune(agent="dqm"), r"finetune\.agent: 'dqm' is not known, did you mean 'dqn'"),
         (finetune(agent="REMOVED"), r"finetune\.agent must name an agent, such as dqn, is None"),
         (finetune(agent=["dqn"]), r"finetune\.agent must name an agent"),
         (finetune(runs=["Spiral"]), r"finetune\.runs must map names to values"),
         (finetune(runs={"a b": {"env": "LoopWorld"}}), r"finetune\.runs: 'a b' cannot name a folder"),
         (finetune(runs={"a": {}}), r"finetune\.runs\.a\.env must name an environment, such as SpiralWorld"),
-        (finetune(runs={"a": {"env": "X", "step": 3}}), r"finetune\.runs\.a: 'step' is not known did you mean 'steps'"),
+        (
+            finetune(runs={"a": {"env": "X", "step": 3}}),
+            r"finetune\.runs\.a: 'step' is not known, did you mean 'steps'",
+        ),
         (finetune(runs={"a": {"env": "X", "seed": 3}}), r"finetune\.runs\.a: 'seed' follows from"),
         (finetune(**{"with": {"encoder": "x"}}), r"finetune\.with: 'encoder' follows from"),
         (finetune(**{"with": {3: 4}}), r"finetune\.with: 3 is no option of finetune"),
         (text(finetune=["dqn"]), "finetune must map names to values"),
-        (grid(finetune={"run": {}}), r"unknown key 'grids\.g\.finetune\.run' did you mean 'runs'"),
-        (grid(finetune={"with": {"step": 3}}), r"grids\.g\.finetune\.with: 'step' is not known did you mean 'steps'"),
+        (grid(finetune={"run": {}}), r"unknown key 'grids\.g\.finetune\.run', did you mean 'runs'"),
+        (grid(finetune={"with": {"step": 3}}), r"grids\.g\.finetune\.with: 'step' is not known, did you mean 'steps'"),
         (
             text({"g": {"settings": {"a": {"pretraned": False}}}}),
-            r"grids\.g\.settings\.a: 'pretraned' is not known did you mean 'pretrained'",
+            r"grids\.g\.settings\.a: 'pretraned' is not known, did you mean 'pretrained'",
         ),
         (text(show=["scratch"]), r"show: 'scratch' is not pre-trained, it has no latents to show"),
-        (text(maps=["scrotch"]), r"maps: 'scrotch' is not known did you mean 'scratch'"),
+        (text(maps=["scrotch"]), r"maps: 'scrotch' is not known, did you mean 'scratch'"),
         (text(finetune_curves="eval/success"), r"finetune_curves must be a list of words"),
     ],
 )

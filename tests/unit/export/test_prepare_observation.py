@@ -99,7 +99,7 @@ def test_the_prepared_environment_is_a_valid_one(space):
     [
         (Box(0, 255, (9, 9, 3), np.uint8), r"'front' has shape \(9, 9, 3\), the encoder takes frames of \(3, 8, 10\)"),
         (Box(0, 1, (3, 8, 10), np.float32), r"'front' is float32, the encoder takes uint8"),
-        (Dict({"frnt": FIRST}), r"no observation 'front' did you mean 'frnt'\?"),
+        (Dict({"frnt": FIRST}), r"no observation 'front', did you mean 'frnt'\?"),
         (Discrete(5), r"'front' is int64, the encoder takes uint8"),
     ],
 )
