@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any, NoReturn, get_type_hints
 
@@ -141,7 +142,30 @@ def _load(place: str) -> Callable[..., Any]:
 
 
 def _call(verb: str, function: Callable[..., Any], arguments: list[str]) -> Any:
-    """Call a function with what its signature reads from the arguments: required ones by place, others by name."""
+    return function(**parse(verb, function, arguments))
+
+
+def check_finetune(arguments: Sequence[str]) -> None:
+    """Check the arguments of ``finetune``, agent first, before anything that they need is there.
+
+    Raises:
+        UserError: an unknown option, one of another type, or what the agent's check finds.
+    """
+    from repdib_lightning.rl import AGENTS, CHECKS
+
+    name, rest = _choose("finetune", "agent", AGENTS, list(arguments))
+    _load(CHECKS[name])(**parse(f"finetune {name}", _load(AGENTS[name]), rest))
+
+
+def parse(verb: str, function: Callable[..., Any], arguments: list[str]) -> dict[str, Any]:
+    """All arguments of a function, as its signature reads them from words: required ones by place, others by name.
+
+    Args:
+        verb: what the help calls it. function: typed and documented. arguments: words of the command line.
+
+    Raises:
+        UserError: an unknown option, a missing one, or a value of another type.
+    """
     from jsonargparse import ArgumentParser
 
     from repdib_lightning.option_errors import one_line
@@ -156,16 +180,22 @@ def _call(verb: str, function: Callable[..., Any], arguments: list[str]) -> Any:
     except argparse.ArgumentError as error:
         known = [option[2:] for action in parser._actions for option in action.option_strings if option[:2] == "--"]
         raise one_line(error, known, {}) from error
-    return function(**parser.instantiate(options).as_dict())
+    return parser.instantiate(options).as_dict()  # type: ignore[no-any-return]
 
 
 def _spelled_out(function: Callable[..., Any], arguments: list[str]) -> list[str]:
-    """Give bare flags of yes-or-no parameters their value: ``--overwrite`` means ``--overwrite true``."""
+    """Give bare flags of yes-or-no parameters their value: ``--overwrite`` means ``--overwrite true``.
+
+    A word behind a flag is its value where it cannot be a required argument.
+    """
     hints = get_type_hints(function)
+    required = any(given.default is Parameter.empty for given in signature(function).parameters.values())
     flags = {f"--{name}" for name, hint in hints.items() if hint is bool}
     spelled: list[str] = []
     for index, argument in enumerate(arguments):
         following = arguments[index + 1 : index + 2]
-        bare = argument in flags and following not in (["true"], ["false"])
-        spelled.append(f"{argument}=true" if bare else argument)
+        valued = following in (["true"], ["false"]) or (
+            not required and following and not following[0].startswith("--")
+        )
+        spelled.append(f"{argument}=true" if argument in flags and not valued else argument)
     return spelled

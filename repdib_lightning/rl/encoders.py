@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,29 @@ from torch import nn
 from repdib_lightning.bottlenecks import Identity
 from repdib_lightning.encoders import ConvolutionalEncoder
 from repdib_lightning.errors import UserError
-from repdib_lightning.export.description import bundle_config
+from repdib_lightning.export.description import CONFIG, bundle_config
 from repdib_lightning.export.frozen import FrozenEncoder
 from repdib_lightning.records import ArraySpec, DataSpec
 from repdib_lightning.rl.features import BottleneckFeatures
+
+FRESH_FEATURES, FRESH_CHANNELS, FRESH_STRIDES = 128, 16, (3, 2)
+"""Of a fresh encoder unless chosen: those of the mazes' pre-training."""
 
 PICTURE = "picture"
 """Name of the observation where an environment gives a bare array."""
 
 
-def fresh_description(space: gymnasium.Space[Any], features: int, channels: int, strides: list[int]) -> dict[str, Any]:
+def fresh_description(
+    space: gymnasium.Space[Any],
+    features: int | None = None,
+    channels: int | None = None,
+    strides: Sequence[int] | None = None,
+) -> dict[str, Any]:
     """Describe a :class:`ConvolutionalEncoder` without a bottleneck for an environment's pictures.
+
+    Args:
+        space: of the environment's observations.
+        features, channels, strides: of the encoder; by default those of the mazes' pre-training.
 
     Raises:
         UserError: no picture, one too small for the strides, or sizes out of range.
@@ -31,8 +44,14 @@ def fresh_description(space: gymnasium.Space[Any], features: int, channels: int,
     arrays = {name: ArraySpec(_channels_first(part)) for name, part in named.items() if _is_picture(part)}
     if not arrays:
         raise UserError(f"--env: gives no picture (uint8, height x width x channels) but {space}")
-    encoder = ConvolutionalEncoder(DataSpec(arrays), features=features, channels=channels, strides=strides)
-    return bundle_config(encoder, Identity(features), {}, {})
+    width = FRESH_FEATURES if features is None else features
+    encoder = ConvolutionalEncoder(
+        DataSpec(arrays),
+        features=width,
+        channels=FRESH_CHANNELS if channels is None else channels,
+        strides=list(FRESH_STRIDES if strides is None else strides),
+    )
+    return bundle_config(encoder, Identity(width), {}, {})
 
 
 def load_into(network: nn.Module, pretrained: FrozenEncoder) -> None:
@@ -57,12 +76,16 @@ def checked_bundle(path: Path | None) -> Path | None:
     """A bundle's folder; of a run's folder, the bundle in it.
 
     Raises:
-        UserError: neither.
+        UserError: neither, with the command that exports one.
     """
     if path is None:
         return None
     inside = path / "bundle"
     found = inside if inside.is_dir() else path
-    if not found.is_dir():
-        raise UserError(f"--encoder {path}: no such bundle; export one: python -m repdib_lightning export RUN")
+    if not (found / CONFIG).is_file():
+        what = "holds no bundle" if path.is_dir() else "is a file, a bundle is a folder" if path.exists() else ""
+        run = path if (path / "checkpoints").is_dir() else "RUN"
+        raise UserError(
+            f"--encoder {path}: {what or 'no such bundle'}; export one: python -m repdib_lightning export {run}"
+        )
     return found

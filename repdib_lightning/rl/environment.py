@@ -17,7 +17,7 @@ def open_environment(name: str, options: Mapping[str, Any]) -> gymnasium.Env[Any
     """Open an environment of this package by its short name (``SpiralWorld``), or any by its gymnasium id.
 
     Raises:
-        UserError: no such environment, options it does not take, or actions that are not discrete.
+        UserError: no such environment, or options it does not take.
     """
     register()
     short = {known.removeprefix("repdib/").partition("-")[0]: known for known in GYMNASIUM_IDS}
@@ -32,9 +32,13 @@ def open_environment(name: str, options: Mapping[str, Any]) -> gymnasium.Env[Any
         raise UserError(f"--env {name}: {error}") from error
     except Exception as error:  # whatever the constructors of other packages raise
         raise UserError(f"--env {name}: {(str(error) or type(error).__name__).splitlines()[0]}") from error
-    if not isinstance(environment.action_space, gymnasium.spaces.Discrete):
-        raise UserError(f"--env {name}: DQN needs discrete actions, these are {environment.action_space}")
     return environment
+
+
+def check_discrete(name: str, environment: gymnasium.Env[Any, Any], agent: str) -> None:
+    """Raise UserError unless the actions of an environment are discrete, as an agent needs them."""
+    if not isinstance(environment.action_space, gymnasium.spaces.Discrete):
+        raise UserError(f"--env {name}: {agent} needs discrete actions, these are {environment.action_space}")
 
 
 def maze_of(environment: gymnasium.Env[Any, Any]) -> MazeEnv | None:

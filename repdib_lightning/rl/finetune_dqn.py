@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from repdib_lightning.errors import UserError
+from repdib_lightning.rl.devices import check_device_name
 from repdib_lightning.rl.options import DQNOptions, check_options
+from repdib_lightning.rl.run_folders import check_folder, make_folder
 
 
 def finetune_dqn(
@@ -33,9 +33,9 @@ def finetune_dqn(
     n_steps: int = 1,
     exploration_fraction: float = 0.6,
     exploration_final_eps: float = 0.05,
-    features: int = 128,
-    channels: int = 16,
-    strides: list[int] = [3, 2],  # noqa: B006 (read from the signature, never changed)
+    features: int | None = None,
+    channels: int | None = None,
+    strides: list[int] | None = None,
     evaluate_every: int = 250,
     device: str = "auto",
     overwrite: bool = False,
@@ -52,7 +52,8 @@ def finetune_dqn(
         frozen: leave the encoder as it is; each frame is encoded once, and the replay buffer holds latents.
         steps: of the environment.
         seed: of weights, exploration and environment.
-        env_options: of the environment, such as --env_options.distractors procedural or --env_options.goals none.
+        env_options: of the environment, such as --env_options.distractors procedural. The mazes have goals, start,
+            size, cell_pixels, episode_length, show_walls, distractors, distractor_seed and evaluation.
         bottleneck_losses: weight of the bottleneck's own losses while its encoder is fine-tuned; 0 leaves them out.
         learning_rate: Adam's, of agent and encoder.
         batch_size: transitions an update.
@@ -65,9 +66,9 @@ def finetune_dqn(
         n_steps: of the return that is bootstrapped from.
         exploration_fraction: share of the steps over which the rate of random actions falls from 1.
         exploration_final_eps: rate of random actions after that.
-        features: width of a fresh encoder.
-        channels: of a fresh encoder's convolutions.
-        strides: of a fresh encoder's convolutions.
+        features: width of a fresh encoder (128); means nothing beside --encoder, as the two that follow.
+        channels: of a fresh encoder's convolutions (16).
+        strides: of a fresh encoder's convolutions ([3, 2]).
         evaluate_every: steps between evaluations of the greedy policy.
         device: cpu, cuda, or auto.
         overwrite: replace an earlier run of this verb.
@@ -78,19 +79,42 @@ def finetune_dqn(
     Raises:
         UserError: a bad option, an unknown environment, a bundle that does not fit it; nothing is left behind then.
     """
-    given = dict(locals())
-    options = DQNOptions(**{name: given[name] for name in DQNOptions.__dataclass_fields__})
+    options = DQNOptions.of(locals())
     check_options(options)
     _check_installed()
     folder = run or Path("runs") / f"dqn-{env.rpartition('/')[2]}-{time.strftime('%Y%m%d-%H%M%S')}"
-    _check_folder(folder, overwrite)
+    check_folder(folder, overwrite)
     # Imported here, since Stable-Baselines3 is an extra of this package.
     from repdib_lightning.rl.training import Training, report
 
     training = Training(options)
-    _make(folder)
+    make_folder(folder)
     training.train(folder)
     return f"{report(training.finish(folder))}    wrote {folder}"
+
+
+def check_dqn(**given: Any) -> None:
+    """Check the arguments of :func:`finetune_dqn` as far as that is possible without the bundle.
+
+    Whether the bundle is there and fits, whether this machine has the device, and whether the run's folder can be
+    made are left to the training.
+
+    Raises:
+        UserError: a number out of range, options that exclude each other, an environment that cannot be opened, or one
+            that DQN or a fresh encoder cannot take.
+    """
+    options = DQNOptions.of(given)
+    check_options(options)
+    check_device_name(options.device)
+    _check_installed()
+    from repdib_lightning.rl.encoders import fresh_description
+    from repdib_lightning.rl.environment import check_discrete, open_environment
+
+    environment = open_environment(options.env, options.env_options or {})
+    check_discrete(options.env, environment, "DQN")
+    if options.encoder is None:
+        fresh_description(environment.observation_space, options.features, options.channels, options.strides)
+    environment.close()
 
 
 def _check_installed() -> None:
@@ -98,29 +122,3 @@ def _check_installed() -> None:
         import stable_baselines3  # noqa: F401
     except ImportError as error:
         raise UserError("finetune needs Stable-Baselines3: pip install 'repdib_lightning[rl]'") from error
-
-
-def _check_folder(folder: Path, overwrite: bool) -> None:
-    """An existing folder is replaced only where this verb made it."""
-    from repdib_lightning.rl.options import CONFIGURATION
-
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return
-    if not overwrite:
-        raise UserError(f"--run {folder}: exists already; choose another folder or pass --overwrite")
-    if not (folder / CONFIGURATION).is_file():
-        raise UserError(f"--run {folder}: is no run of finetune, so --overwrite does not replace it")
-
-
-def _make(folder: Path) -> None:
-    try:
-        if folder.is_dir():
-            shutil.rmtree(folder)
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise UserError(f"--run {folder}: cannot be made ({error.strerror or error})") from error
-
-
-def plain(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options as JSON can hold them."""
-    return {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}

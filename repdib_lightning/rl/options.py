@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from repdib_lightning.errors import UserError
+from repdib_lightning.rl import FRESH_OPTIONS
 
 CONFIGURATION, OUTCOME = "finetune.json", "outcome.json"
 
@@ -33,11 +35,16 @@ class DQNOptions:
     n_steps: int
     exploration_fraction: float
     exploration_final_eps: float
-    features: int
-    channels: int
-    strides: list[int]
+    features: int | None
+    channels: int | None
+    strides: list[int] | None
     evaluate_every: int
     device: str
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> DQNOptions:
+        """Pick these out of all arguments of the verb."""
+        return cls(**{name: given[name] for name in cls.__dataclass_fields__})
 
 
 _COUNTS = ("steps", "batch_size", "hidden", "buffer_size", "train_freq", "n_steps", "evaluate_every")
@@ -62,9 +69,19 @@ def check_options(options: DQNOptions) -> None:
             raise UserError(f"--{name} must not be negative, is {getattr(options, name)}")
     if options.learning_starts >= options.steps:
         raise UserError(f"--learning_starts {options.learning_starts}: must be below --steps {options.steps}")
+    if options.buffer_size < options.batch_size:
+        raise UserError(f"--buffer_size {options.buffer_size}: must hold a batch, --batch_size is {options.batch_size}")
     if options.seed >= 2**32:
         raise UserError(f"--seed must be below {2**32}, is {options.seed}")
     if options.n_steps > 1 and not options.frozen:
         raise UserError(f"--n_steps {options.n_steps}: Stable-Baselines3 keeps longer returns with --frozen only")
     if options.frozen and options.encoder is None:
         raise UserError("--frozen needs --encoder BUNDLE: a fresh encoder that is never trained knows nothing")
+    for name in FRESH_OPTIONS:
+        if options.encoder is not None and getattr(options, name) is not None:
+            raise UserError(f"--{name}: is of a fresh encoder, --encoder {options.encoder} has its own; leave it out")
+
+
+def plain(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options as JSON can hold them."""
+    return {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}

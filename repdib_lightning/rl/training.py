@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from stable_baselines3.common.logger import configure
 
 from repdib_lightning.data.files import whole_file
@@ -21,13 +20,14 @@ from repdib_lightning.export.frozen import FrozenEncoder
 from repdib_lightning.export.gymnasium_wrapper import EncodeObservation, PrepareObservation
 from repdib_lightning.export.load import load_encoder
 from repdib_lightning.records import DataSpec
+from repdib_lightning.rl import FRESH_OPTIONS
+from repdib_lightning.rl.devices import check_device
 from repdib_lightning.rl.dqn import BottleneckDQN
 from repdib_lightning.rl.encoders import checked_bundle, fresh_description, load_into
-from repdib_lightning.rl.environment import maze_of, open_environment
+from repdib_lightning.rl.environment import check_discrete, maze_of, open_environment
 from repdib_lightning.rl.evaluation import EpisodeEvaluation, MazeEvaluation
 from repdib_lightning.rl.features import BottleneckFeatures
-from repdib_lightning.rl.finetune_dqn import plain
-from repdib_lightning.rl.options import CONFIGURATION, OUTCOME, DQNOptions
+from repdib_lightning.rl.options import CONFIGURATION, OUTCOME, DQNOptions, plain
 from repdib_lightning.rl.progress import POLICY, Progress
 from repdib_lightning.rl.visits import CountVisits
 from repdib_lightning.versions import versions
@@ -45,8 +45,9 @@ class Training:
 
     def __init__(self, options: DQNOptions) -> None:
         self.options = options
-        _check_device(options.device)
+        check_device(options.device)
         bare = open_environment(options.env, options.env_options or {})
+        check_discrete(options.env, bare, "DQN")
         self.maze = maze_of(bare)
         self.visits = CountVisits(bare, self.maze) if self.maze is not None else None
         environment = bare if self.visits is None else self.visits
@@ -55,6 +56,8 @@ class Training:
         if self.pretrained is None:
             space = bare.observation_space
             self.description = fresh_description(space, options.features, options.channels, options.strides)
+            sizes = self.description["encoder"]["arguments"]
+            self.options = options = replace(options, **{name: sizes[name] for name in FRESH_OPTIONS})
         else:
             self.description = self.pretrained.description
         self.spec = DataSpec.from_dict(self.description["spec"])
@@ -193,12 +196,6 @@ class Training:
             found |= {"coverage": covered(self.visits.visits), "entropy": visitation_entropy(self.visits.visits)}
             found["mean_coverage"] = float(self.progress.curve("train/coverage").mean())
         return found
-
-
-def _check_device(name: str) -> None:
-    """Stable-Baselines3 would take the CPU in place of a GPU that is not there, and say nothing."""
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise UserError(f"--device {name}: there is no such device (choices: auto, cpu)")
 
 
 def report(outcome: dict[str, Any]) -> str:

@@ -185,7 +185,10 @@ def complaint(capsys, *arguments: str) -> str:
         (["--env_options.goals", "6,2"], "goals=6,2: lies outside of GridWorld"),
         (["--env_options.goals", "2.5,2"], "goals=2.5,2: lies in a wall between the cells of GridWorld"),
         (["--env_options", "5"], "env_options"),
-        (["--encoder", "nowhere"], "--encoder nowhere: no such bundle"),
+        (
+            ["--encoder", "nowhere"],
+            "--encoder nowhere: no such bundle; export one: python -m repdib_lightning export RUN",
+        ),
         (["--frozen"], "--frozen needs --encoder BUNDLE"),
         (["--run", "taken"], "--run taken: exists already; choose another folder or pass --overwrite"),
         (["--run", "taken", "--overwrite"], "--run taken: is no run of finetune, so --overwrite does not replace it"),
@@ -204,7 +207,18 @@ def complaint(capsys, *arguments: str) -> str:
         (["--n_steps", "3"], "--n_steps 3: Stable-Baselines3 keeps longer returns with --frozen only"),
         (["--features", "0"], "features must be at least 1, is 0"),
         (["--strides", "[9,9,9]"], "30x30 pixels is too small for strides"),
-        (["--device", "gpu"], "--device gpu: "),
+        (
+            ["--features", "64", "--encoder", "x"],
+            "--features: is of a fresh encoder, --encoder x has its own; leave it",
+        ),
+        (["--strides", "[2]", "--encoder", "x"], "--strides: is of a fresh encoder, --encoder x has its own; leave it"),
+        (["--buffer_size", "100"], "--buffer_size 100: must hold a batch, --batch_size is 128"),
+        (["--encoder", "taken"], "--encoder taken: holds no bundle; export one: python -m repdib_lightning export RUN"),
+        (["--encoder", "taken/file"], "--encoder taken/file: is a file, a bundle is a folder; export one: python"),
+        (["--frozen", "maybe"], "frozen: expected bool, got 'maybe'"),
+        (["--device", "gpu"], "--device gpu: there is no such device, did you mean 'cpu'? (choices: auto, cpu, cuda)"),
+        (["--device", "cuda:x"], "--device cuda:x: there is no such device, did you mean 'cuda'?"),
+        (["--device", "cuda:99"], "--device 'cuda:99' cannot be used here, "),
         (["--buffer_size", "1000000000000"], "--buffer_size 1000000000000: does not fit into memory"),
     ],
 )
@@ -222,9 +236,20 @@ def test_a_bundle_of_other_pictures_names_both_shapes(pretrained, here, capsys):
         assert "(3, 30, 30)" in said and "(3, 18, 18)" in said
 
 
-def test_a_gpu_that_is_not_there_is_not_replaced_by_the_cpu(here, capsys, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    assert "--device cuda:1: there is no such device" in complaint(capsys, "--device", "cuda:1", "--run", "r")
+def test_a_run_that_was_not_exported_says_how(here, capsys):
+    Path("r/checkpoints").mkdir(parents=True)
+    said = complaint(capsys, "--encoder", "r", "--run", "mine")
+    assert said.endswith("--encoder r: holds no bundle; export one: python -m repdib_lightning export r")
+
+
+def test_what_a_fresh_encoder_is_made_of_is_recorded(pretrained, here):
+    assert finetune("--run", "fresh", *TINY, "--features", "8") == 0
+    used = outcome("fresh")["configuration"]
+    assert (used["features"], used["channels"], used["strides"]) == (8, 16, [3, 2])
+    assert used == json.loads(Path("fresh/finetune.json").read_text())
+    assert load_encoder("fresh/bundle").features == 8
+    assert finetune("--run", "given", "--encoder", str(pretrained), *TINY) == 0
+    assert outcome("given")["configuration"]["features"] is None
 
 
 def test_without_stable_baselines3(here, capsys, monkeypatch):
