@@ -25,6 +25,26 @@ def sync_file(path: Path) -> None:
         os.fsync(handle.fileno())
 
 
+def write_at(handle: int, content: bytes | memoryview, offset: int) -> None:
+    """Write all of it at a place of an open file. Raises OSError, such as a full disk."""
+    rest = memoryview(content)
+    while len(rest):
+        written = os.pwrite(handle, rest, offset)
+        rest, offset = rest[written:], offset + written
+
+
+def read_at(handle: int, size: int, offset: int) -> bytearray:
+    """Read ``size`` bytes from a place of an open file. Raises OSError if there are fewer."""
+    content = bytearray(size)
+    rest = memoryview(content)
+    while len(rest):
+        count = os.preadv(handle, [rest], offset)
+        if not count:
+            raise OSError(f"ends at byte {offset}, {len(rest)} bytes more were expected")
+        rest, offset = rest[count:], offset + count
+    return content
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path in the target's own folder; on success it becomes ``path``, on error it vanishes.

@@ -21,6 +21,12 @@ class ContentHash:
     def __init__(self) -> None:
         self._hash = hashlib.blake2b(digest_size=16)
 
+    def copy(self) -> ContentHash:
+        """The same episodes so far; what is added to one is not added to the other."""
+        twin = ContentHash()
+        twin._hash = self._hash.copy()
+        return twin
+
     def add_episode(self, arrays: dict[str, np.ndarray], *, evaluation: bool) -> None:
         """Add the rows of one episode: key in the store -> (T, ...), as stored, and whether it is held out."""
         length = len(next(iter(arrays.values())))

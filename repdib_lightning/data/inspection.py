@@ -21,6 +21,7 @@ from repdib_lightning.data.fingerprint import recompute_fingerprint
 from repdib_lightning.data.foreign import describe_foreign
 from repdib_lightning.data.inspection_text import bar, file_size, short_number, spread, table
 from repdib_lightning.data.outputs import check_output_file
+from repdib_lightning.data.partial import describe_unfinished
 from repdib_lightning.errors import UserError
 
 _MOST_LISTED = 12
@@ -50,7 +51,7 @@ class Inspection:
 def inspect_store(path: Path, *, contact_sheet: Path | None = None, verify: bool = False) -> Inspection:
     """Describe a store: schema, layout, counts, ranges, factors, warnings; and draw a contact sheet.
 
-    Data of other programs are named, with the command that converts them.
+    Data of other programs are named, with the command that converts them; an unfinished recording is one line.
 
     Args:
         path: the store; or a file or folder of another format.
@@ -67,9 +68,9 @@ def inspect_store(path: Path, *, contact_sheet: Path | None = None, verify: bool
     path = Path(path)
     if contact_sheet is not None:
         check_output_file(Path(contact_sheet), "--contact_sheet", ".png", [path])
-    foreign = describe_foreign(path)
-    if foreign is not None:
-        return Inspection(foreign)
+    other = describe_unfinished(path) or describe_foreign(path)
+    if other is not None:
+        return Inspection(other)
     if path.is_dir():
         raise UserError(f"{path}: a folder in which no import finds its files (expected: *.npz, *.hdf5 or a *.csv)")
     store = EpisodeStore(path)

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import glob
 import os
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import h5py
 import numpy as np
 
 from repdib_lightning.data.episode_checks import check_episode, check_stated, columns_of, flat, plain_attributes
-from repdib_lightning.data.files import sync_directory, sync_file
+from repdib_lightning.data.files import sync_directory
 from repdib_lightning.data.fingerprint import ContentHash
-from repdib_lightning.data.schema import FORMAT, SCHEMA_VERSION, FactorSpec
+from repdib_lightning.data.partial import open_partial, partial_of
+from repdib_lightning.data.row_file import RowFile, make_empty
+from repdib_lightning.data.schema import FactorSpec
+from repdib_lightning.data.statement import Statement
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import ActionSpec, ArraySpec
+
+_REFUSED = (OSError, RuntimeError, ValueError, TypeError)  # by the disk, or by HDF5, such as a number of 70 bits
 
 
 class EpisodeWriter:
@@ -24,6 +29,10 @@ class EpisodeWriter:
 
     Use as a context manager: leaving it normally publishes the file (flush, rename), leaving it by an error removes
     what was written.
+
+    With ``resume`` it is kept instead, in ``.NAME.partial`` beside the file, and a writer with the same arguments goes
+    on after the last whole episode, of which ``episodes_done`` tells: whatever ended the process, the finished file
+    is byte for byte that of an uninterrupted recording. After a power cut, too, every episode that counts is whole.
 
     Args:
         path: the file to make; must not exist unless ``overwrite``.
@@ -35,10 +44,14 @@ class EpisodeWriter:
         masks: observation name -> (H, W) of its agent mask.
         rewards: whether rewards, terminations and truncations are written.
         attributes: environment, generating configuration, seed, licence; plain values, nested ones become JSON.
+        overwrite: replace an existing file; with ``resume``, discard an unfinished recording, too.
+        resume: keep what an interruption leaves, and go on with it.
 
     Raises:
         UserError: the path exists or is a folder, cannot be written, the disk is full, or what is stated cannot be a
-            store; on leaving: fewer rows or episodes than stated were added (no file appears then).
+            store; with ``resume``: an unfinished recording is there that other arguments began (told which), that is
+            damaged, or that another process is writing; on leaving: fewer rows or episodes than stated were added (no
+            file appears then).
     """
 
     def __init__(
@@ -54,6 +67,7 @@ class EpisodeWriter:
         rewards: bool = False,
         attributes: dict[str, Any] | None = None,
         overwrite: bool = False,
+        resume: bool = False,
     ) -> None:
         self.path = Path(path)
         if self.path.is_dir():
@@ -66,62 +80,63 @@ class EpisodeWriter:
         self.rows, self.episodes = rows, episodes
         self.observations, self.actions = observations, actions
         self._columns = columns_of(observations, actions, factors, masks, rewards)
+        self._resume, self._overwrite = resume, overwrite
         self._row = self._episode = 0
         self._hash = ContentHash()
         self._temporary = self.path.with_name(f".{self.path.name}.tmp-{os.getpid()}")
+        self._file: RowFile | None = None
+        statement = Statement(rows, episodes, self._columns, actions, factors, masks, plain)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             remove_leftovers(self.path)
             self._check_space(observations)
-            self._file = h5py.File(self._temporary, "w")
-        except OSError as error:
-            raise self._cannot_write(error) from error
-        try:
-            self._allocate(factors, masks)
-            self._file.attrs.update({"format": FORMAT, "schema_version": SCHEMA_VERSION, **plain})
-        except (OSError, RuntimeError, ValueError) as error:  # HDF5's limits, such as 64 KiB an attribute
+            self._file = self._open(statement)
+            self._go_on()
+        except BaseException as error:
             self._discard()
-            raise self._cannot_write(error) from error
+            if isinstance(error, _REFUSED) and not isinstance(error, UserError):
+                raise self._cannot_write(error) from error
+            raise
+
+    @property
+    def episodes_done(self) -> int:
+        """How many episodes are written; with ``resume`` those of earlier, interrupted recordings count."""
+        return self._episode
+
+    def _open(self, statement: Statement) -> RowFile:
+        if self._resume:
+            return open_partial(self.path, statement, self._temporary, begin_anew=self._overwrite)
+        make_empty(self._temporary, statement)
+        return RowFile(self._temporary, os.open(self._temporary, os.O_RDWR))
+
+    def _go_on(self) -> None:
+        """Hash the episodes that are there, one at a time."""
+        assert self._file is not None
+        for length in map(int, self._file.lengths()):
+            rows = {key: self._file.read(key, self._row, length) for key in self._columns}
+            evaluation = bool(self._file.read("episodes/evaluation", self._episode, 1)[0, 0])
+            self._hash.add_episode(rows, evaluation=evaluation)
+            self._row, self._episode = self._row + length, self._episode + 1
 
     def _check_space(self, observations: dict[str, ArraySpec]) -> None:
         width = {"uint8": 1, "float32": 4}
         needed = self.rows * sum(int(np.prod(s.shape)) * width[s.dtype] for s in observations.values())
+        partial = partial_of(self.path)
+        if self._resume and partial.is_file():
+            needed -= partial.stat().st_blocks * 512
         status = os.statvfs(self.path.parent)
         if needed > status.f_bavail * status.f_frsize:
             free = status.f_bavail * status.f_frsize / 2**20
             raise UserError(f"{self.path}: cannot be written (needs {needed / 2**20:.0f} MiB, {free:.0f} MiB are free)")
 
     def _cannot_write(self, error: Exception) -> UserError:
-        return UserError(f"{self.path}: cannot be written ({getattr(error, 'strerror', None) or error})")
+        reason = f"{self.path}: cannot be written ({getattr(error, 'strerror', None) or error})"
+        kept = self._resume and self._file is not None
+        return UserError(f"{reason}; {self._kept()}" if kept else reason)
 
-    def _dataset(self, name: str, shape: tuple[int, ...], dtype: str) -> h5py.Dataset:
-        """A contiguous data set whose place in the file is fixed now, so that it can be memory-mapped."""
-        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        layout.set_layout(h5py.h5d.CONTIGUOUS)
-        layout.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-        layout.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-        layout.set_obj_track_times(False)
-        parent = self._file.require_group(name.rpartition("/")[0] or "/")
-        leaf = name.rpartition("/")[2].encode()
-        space = h5py.h5s.create_simple(shape)
-        kind = h5py.h5t.py_create(np.dtype(dtype), logical=True)
-        return h5py.Dataset(h5py.h5d.create(parent.id, leaf, kind, space, layout))
-
-    def _allocate(self, factors: dict[str, FactorSpec], masks: dict[str, tuple[int, int]]) -> None:
-        for name, column in self._columns.items():
-            self._dataset(name, (self.rows, *column.stored_shape), column.stored_dtype)
-        if self.actions is not None:
-            self._file["actions"].attrs.update({"kind": self.actions.kind, "size": self.actions.size})
-        for name, factor in factors.items():
-            attributes = self._file[f"factors/{name}"].attrs
-            attributes.update({"kind": factor.kind, "scale": factor.scale})
-            if factor.scale == "categorical":
-                attributes["classes"] = factor.classes
-        for name, (_, width) in masks.items():
-            self._file[f"masks/{name}"].attrs["width"] = width
-        for name in ("start", "length"):
-            self._dataset(f"episodes/{name}", (self.episodes,), "int64")
-        self._dataset("episodes/evaluation", (self.episodes,), "bool")
+    def _kept(self) -> str:
+        command = "the same command without --overwrite" if self._overwrite else "the same command"
+        return f"{self._episode} of {self.episodes} episodes are kept, {command} goes on after them"
 
     def add_episode(
         self,
@@ -150,7 +165,7 @@ class EpisodeWriter:
                 stated (named with key and episode; nothing of the episode is written), the disk is full.
         """
         where = f"{self.path}: episode {self._episode}"
-        if not self._file:
+        if self._file is None:
             raise UserError(f"{where}: the writer is closed; add episodes inside its `with` block")
         if not isinstance(evaluation, (bool, np.bool_)):
             raise UserError(f"{where}: evaluation is {evaluation!r}; expected True or False")
@@ -162,17 +177,19 @@ class EpisodeWriter:
         if rows.stop > self.rows or self._episode >= self.episodes:
             stated = f"the writer was made for {self.rows} rows in {self.episodes} episodes"
             raise UserError(f"{where} ends at row {rows.stop}, but {stated}")
-        evaluation = bool(evaluation)
+        content = self._hash.copy()
+        content.add_episode(arrays, evaluation=bool(evaluation))
         try:
-            for name, array in arrays.items():
-                self._file[name][rows] = array
-            self._hash.add_episode(arrays, evaluation=evaluation)
-            self._file["episodes/start"][self._episode] = rows.start
-            self._file["episodes/length"][self._episode] = length
-            self._file["episodes/evaluation"][self._episode] = evaluation
+            for key, array in arrays.items():
+                self._file.write(key, rows.start, array)
+            self._file.write("episodes/start", self._episode, np.array([rows.start]))
+            self._file.write("episodes/evaluation", self._episode, np.array([bool(evaluation)]))
+            if self._resume:
+                self._file.flush()  # nothing may say that rows are there before they are
+            self._file.write("episodes/length", self._episode, np.array([length]))
         except OSError as error:
             raise self._cannot_write(error) from error
-        self._row, self._episode = rows.stop, self._episode + 1
+        self._hash, self._row, self._episode = content, rows.stop, self._episode + 1
 
     def __enter__(self) -> EpisodeWriter:
         return self
@@ -187,21 +204,26 @@ class EpisodeWriter:
             self._discard()
 
     def _discard(self) -> None:
-        if self._file:
-            self._file.close()
+        if self._file is not None:
+            file, self._file = self._file, None
+            if self._resume:
+                with suppress(OSError):
+                    file.flush()
+            file.close()
         self._temporary.unlink(missing_ok=True)
 
     def _publish(self) -> None:
+        assert self._file is not None
         if (self._row, self._episode) != (self.rows, self.episodes):
+            kept = f"; {self._kept()}" if self._resume else ""
             raise UserError(
                 f"{self.path}: not written, {self._row} rows in {self._episode} episodes were added, "
-                f"{self.rows} rows in {self.episodes} episodes were stated"
+                f"{self.rows} rows in {self.episodes} episodes were stated{kept}"
             )
         try:
-            self._file.attrs["fingerprint"] = self._hash.hexdigest()
-            self._file.close()
-            sync_file(self._temporary)
-            os.replace(self._temporary, self.path)
+            self._file.flush()
+            self._file.seal(self._hash.hexdigest())
+            os.replace(self._file.path, self.path)
             sync_directory(self.path.parent)
         except OSError as error:
             raise self._cannot_write(error) from error
