@@ -21,7 +21,7 @@ from repdib_lightning.experiments.points import Point, State, points_of
 from repdib_lightning.experiments.slurm import jobs_in_queue
 from repdib_lightning.experiments.suite import PHASES, Suite, check_seeds
 from repdib_lightning.experiments.suite_file import read_suite
-from repdib_lightning.verbs import Outcome
+from repdib_lightning.verbs import Outcome, check_finetune
 from repdib_lightning.word_lists import words
 
 RUNS = Path("runs/suites")
@@ -70,6 +70,7 @@ def run_suite(
     redone = {point.name for point in points if redo in point.setting.phases}
     stands = [(point, state) for point, state, _ in standing(points)]
     todo = [p for p, state in stands if state in unfinished or (state == "finished" and p.name in redone)]
+    check_finetunings(plan, todo)
     prepare_data(plan, todo)
     for point in todo:
         if point.name in redone:
@@ -136,6 +137,26 @@ def standing(points: Sequence[Point]) -> list[tuple[Point, State, str]]:
         if state == "queued" and detail not in known:
             states[index] = (point, "stopped", f"{detail} is not in the queue")
     return states
+
+
+def check_finetunings(plan: Suite, points: Sequence[Point]) -> None:
+    """Check each different fine-tuning of the points once, since hours of pre-training come before the first of them.
+
+    Raises:
+        UserError: naming the suite's file, the fine-tuning and what is wrong with its options.
+    """
+    checked = set()
+    for point in points:
+        for name, arguments in point.finetune.items():
+            encoder = ["--encoder", str(point.folder / "bundle")] if point.setting.pretrained else []
+            different = (*arguments[: arguments.index("--seed")], bool(encoder))
+            if different in checked:
+                continue
+            checked.add(different)
+            try:
+                check_finetune([*arguments, *encoder])
+            except UserError as error:
+                raise UserError(f"{plan.file}: finetune run '{name}' of {point.setting.place}: {error}") from error
 
 
 def prepare_data(plan: Suite, points: Sequence[Point]) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from repdib_lightning.errors import UserError
+from repdib_lightning.rl import FRESH_OPTIONS
 
 FIRST_DEVELOPMENT_SEED = 100
 """Seeds below are for reporting only; what is tuned is tuned on this one and above."""
@@ -22,7 +23,6 @@ SET_BY_SUITE = ("seed_everything", "data.seed", "data.init_args.seed", "data.pat
 """Options of ``fit`` that follow from the suite's data and seeds, so that no setting may give them."""
 
 PROBE_OPTIONS = ("probes", "device", "seed")
-
 
 PHASES = ("fit", "export", "probe", "finetune")
 """Verbs that points go through, in this order; a setting may have only some of them."""
@@ -44,6 +44,14 @@ class Finetune:
         """What ``finetune`` is given for one of the runs, but for the encoder and the run's folder."""
         options = [word for key, value in self.runs[name].items() for word in (f"--{key}", _as_word(value))]
         return [self.agent, *options, "--seed", str(seed)]
+
+    def of_an_encoder(self) -> Finetune:
+        """The same where an encoder is given: without the options of a fresh one."""
+        runs = {
+            name: {option: value for option, value in options.items() if option not in FRESH_OPTIONS}
+            for name, options in self.runs.items()
+        }
+        return replace(self, runs=runs)
 
 
 @dataclass(frozen=True)

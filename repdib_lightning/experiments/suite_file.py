@@ -20,6 +20,8 @@ from repdib_lightning.experiments.suite_grids import (
     read_grid,
     read_store,
 )
+from repdib_lightning.experiments.suite_measures import check_measures
+from repdib_lightning.rl import FRESH_OPTIONS
 
 
 def find_suite(name: str | Path) -> Path:
@@ -58,7 +60,7 @@ def read_suite(name: str | Path) -> Suite:
     threads = tree.get("threads", 1)
     if type(threads) is not int or threads < 1:
         raise UserError(f"{file}: threads must be at least 1, is {threads!r}")
-    return Suite(
+    suite = Suite(
         name=file.stem,
         title=str(tree.get("title", file.stem)),
         file=file,
@@ -79,6 +81,8 @@ def read_suite(name: str | Path) -> Suite:
         finetune_curves=words(file, "finetune_curves", tree.get("finetune_curves", ["eval/success"])),
         maps=words(file, "maps", tree.get("maps", []), [s.name for grid in built for s in grid.settings]),
     )
+    check_measures(suite)
+    return suite
 
 
 def _grids(file: Path, tree: Mapping[str, Any]) -> tuple[Grid, ...]:
@@ -94,6 +98,7 @@ def _grids(file: Path, tree: Mapping[str, Any]) -> tuple[Grid, ...]:
     if not isinstance(grids, dict) or not grids:
         raise UserError(f"{file}: grids must map names to grids, is {grids!r:.60}")
     built = tuple(read_grid(file, name, content, common) for name, content in grids.items())
+    _check_fresh_options(file, [finetune, *(content.get("finetune") or {} for content in grids.values())], built)
     made: dict[Path, Grid] = {}
     for grid in built:
         first = made.setdefault(grid.data, grid)
@@ -103,6 +108,16 @@ def _grids(file: Path, tree: Mapping[str, Any]) -> tuple[Grid, ...]:
                 f"'{first.name}'; give the stores different names"
             )
     return built
+
+
+def _check_fresh_options(file: Path, given: Sequence[Mapping[str, Any]], grids: Sequence[Grid]) -> None:
+    """Options of a fresh encoder are for settings without pre-training; without any, they would be ignored."""
+    from_scratch = [setting.finetune for grid in grids for setting in grid.settings if not setting.pretrained]
+    used = {option for finetune in from_scratch if finetune for run in finetune.runs.values() for option in run}
+    for content in given:
+        for options in (content.get("with"), *(content.get("runs") or {}).values()):
+            for option in set(options or {}) & set(FRESH_OPTIONS) - used:
+                raise UserError(f"{file}: finetune: '{option}' is of a fresh encoder, and every setting is pre-trained")
 
 
 def _show(file: Path, names: tuple[str, ...], grid: Grid) -> tuple[str, ...]:

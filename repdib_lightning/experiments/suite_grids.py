@@ -161,7 +161,8 @@ def _setting(file: Path, key: str, bare: Setting, parts: Sequence[Mapping[str, A
     options = {k: v for part in (fixed, given) for k, v in part.items() if k != CONFIG}
     options = {"data.path": str(own.data), **options}
     together = _together(configs, options)
-    return replace(bare, configs=tuple(configs), options=options, merged=together, data=own.data)
+    finetune = None if bare.finetune is None else bare.finetune.of_an_encoder()
+    return replace(bare, configs=tuple(configs), options=options, merged=together, data=own.data, finetune=finetune)
 
 
 def _is_pretrained(file: Path, key: str, given: Mapping[str, Any], bare: Setting) -> bool:

@@ -24,7 +24,7 @@ data: small.h5
 seeds: [0, 1]
 finetune:
   agent: dqn
-  with: {steps: 200, env_options.goals: none}
+  with: {steps: 200, learning_starts: 100, env_options.goals: none}
   runs:
     Spiral: {env: SpiralWorld}
     Loop: {env: LoopWorld, steps: 300}
@@ -179,6 +179,39 @@ def test_a_fine_tuning_with_other_options_is_refused_until_it_is_removed(here, c
     assert run("--only", "scratch", "--seeds", "0") == 0
     assert begun(before) == ["finetune Loop"]
     assert record("scratch")["configuration"]["finetune"]["Loop"]["--steps"] == "400"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("steps: 300", "steps: -5", "finetune run 'Loop' of g/none: --steps must be at least 1, is -5"),
+        ("steps: 300", "steps: many", "finetune run 'Loop' of g/none: steps: expected int, got 'many'"),
+        ("env: LoopWorld", "env: LopWorld", "run 'Loop' of g/none: --env LopWorld: no such environment, did you mean"),
+        ("goals: none", "goals: '6,2'", "finetune run 'Spiral' of g/none: --env SpiralWorld: goals=6,2: lies outside"),
+        ("goals: none", "gols: none", "run 'Spiral' of g/none: --env_options.gols: no option of SpiralWorld, did you"),
+        ("steps: 300", "frozen: maybe", "finetune run 'Loop' of g/none: frozen: expected bool, got 'maybe'"),
+        ("steps: 300", "frozen: true", "finetune run 'Loop' of g/scratch: --frozen needs --encoder BUNDLE"),
+        (
+            "steps: 300",
+            "strides: [9, 9, 9]",
+            "finetune run 'Loop' of g/scratch: ConvolutionalEncoder: 'picture' of 30x30",
+        ),
+        ("steps: 300", "device: gpu", "finetune run 'Loop' of g/none: --device gpu: there is no such device"),
+    ],
+)
+def test_a_bad_value_is_told_before_anything_is_collected_or_trained(here, capsys, old, new, said):
+    assert old in SUITE
+    Path("m.yaml").write_text(SUITE.replace(old, new).replace("small.h5", "absent.h5\ncollect: maze --samples 100"))
+    assert run() == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and error.startswith("error: m.yaml: ") and said in error
+    assert not Path("absent.h5").exists() and not calls("begin")
+
+
+def test_a_device_of_another_machine_may_be_asked_for(here, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    Path("m.yaml").write_text(SUITE.replace("steps: 300", "device: cuda"))
+    assert run("--only", "none", "--seeds", "0") == 0
 
 
 def test_a_suite_without_fine_tuning_has_none_to_redo(here, capsys):

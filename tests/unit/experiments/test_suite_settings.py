@@ -6,8 +6,10 @@ import pytest
 import yaml
 
 from repdib_lightning.errors import UserError
+from repdib_lightning.evaluation.probes import DECODER, PROBES
 from repdib_lightning.experiments.points import points_of
 from repdib_lightning.experiments.suite_file import read_suite
+from repdib_lightning.experiments.suite_measures import FACTOR_PROBES, PICTURE_PROBE
 
 RUNS = {"Spiral": {"env": "SpiralWorld", "steps": 300, "env_options.goals": "none"}, "Loop": {"env": "LoopWorld"}}
 FINETUNE = {"agent": "dqn", "with": {"steps": 200, "strides": [2, 2]}, "runs": RUNS}
@@ -53,12 +55,19 @@ def test_fine_tunings_get_what_they_share_and_the_points_seed(tmp_path):
     assert point.setting.phases == ("fit", "export", "probe", "finetune")
     assert point.finetune == {
         "Spiral": [
-            *("dqn", "--steps", "300", "--strides", "[2, 2]", "--env", "SpiralWorld"),
+            *("dqn", "--steps", "300", "--env", "SpiralWorld"),
             *("--env_options.goals", "none", "--seed", "3"),
         ],
-        "Loop": ["dqn", "--steps", "200", "--strides", "[2, 2]", "--env", "LoopWorld", "--seed", "3"],
+        "Loop": ["dqn", "--steps", "200", "--env", "LoopWorld", "--seed", "3"],
     }
     assert point.finetune_folder("Loop") == Path("runs/mine/g/none/seed_3/finetune/Loop")
+
+
+def test_options_of_a_fresh_encoder_are_for_settings_without_pre_training(tmp_path):
+    (point,) = points_of(read(tmp_path), [3], Path("runs"), ["g/scratch"])
+    assert point.finetune["Loop"] == [
+        *("dqn", "--steps", "200", "--strides", "[2, 2]", "--env", "LoopWorld", "--seed", "3")
+    ]
 
 
 def test_without_pre_training_there_is_only_fine_tuning(tmp_path):
@@ -129,6 +138,12 @@ def test_maps_may_be_of_any_grids_settings_and_curves_have_a_default(tmp_path):
     assert suite.maps == ("own", "scratch") and suite.finetune_curves == ("eval/success",)
 
 
+def test_measures_of_probes_codes_training_and_fine_tuning_are_known(tmp_path):
+    names = ["linear/cell/kept", "decoder/agent/rmse", "codes/used", "val/raw/inverse", "dqn/Loop/whatever"]
+    assert read(tmp_path, measures=names, probe={"probes": ["linear", "decoder"]}).measures == tuple(names)
+    assert (*FACTOR_PROBES, PICTURE_PROBE) == (*PROBES, DECODER)
+
+
 # mistakes
 
 
@@ -188,6 +203,29 @@ def finetune(**keys):
         (
             text({"g": {"settings": {"a": {"pretraned": False}}}}),
             r"grids\.g\.settings\.a: 'pretraned' is not known, did you mean 'pretrained'",
+        ),
+        (text({"g": LATER}), r"finetune: 'strides' is of a fresh encoder, and every setting is pre-trained"),
+        (
+            text({"g": LATER}, finetune={**FINETUNE, "with": {}, "runs": {"a": {"env": "X", "features": 8}}}),
+            r"finetune: 'features' is of a fresh encoder, and every setting is pre-trained",
+        ),
+        (text(measures=["dqm/Spiral/success"]), r"measures: 'dqm/Spiral/success': 'dqm' is no .*, did you mean 'dqn'"),
+        (text(measures=["dqn/Spirall/success"]), r"no fine-tuning is called 'Spirall', did you mean 'Spiral'\?"),
+        (text(measures=["dqn/Loop"]), r"measures: 'dqn/Loop': does not say what of the fine-tuning"),
+        (text(measures=["linaer/cell/kept"]), r"'linaer' is no probe or agent here, did you mean 'linear'"),
+        (text(measures=["linear/cell/keptt"]), r"must end in kept or error, did you mean 'kept'"),
+        (text(measures=["mlp/cell/kept"], probe={"probes": "linear"}), r"'mlp' is no probe or agent here"),
+        (text(measures=["decoder/agent/kept"]), r"'decoder' is no probe or agent here"),
+        (text({"g": {"settings": {"s": {"pretrained": False}}}}, measures=["codes/used"]), r"'codes' is no probe or"),
+        (text(probe={"probes": "linear,mlpp"}), r"probe\.probes: 'mlpp' is not known, did you mean 'mlp'"),
+        (text(probe={"probes": "decoder"}), r"probe\.probes: one of linear, mlp is needed"),
+        (text(headline={"a": {"measure": "linaer/time", "paper": {}}}), r"headline\.a\.measure: .*mean 'linear'"),
+        (
+            text(
+                {"g": GRID, "later": {**LATER, "finetune": {"runs": {"Other": {"env": "GridWorld"}}}}},
+                claims={"c": {"grid": "later", "setting": "own", "measure": "dqn/Loop/success", "at_least": 0}},
+            ),
+            r"claims\.c\.measure: 'dqn/Loop/success': no fine-tuning is called 'Loop', choices: Other",
         ),
         (text(show=["scratch"]), r"show: 'scratch' is not pre-trained, it has no latents to show"),
         (text(maps=["scrotch"]), r"maps: 'scrotch' is not known, did you mean 'scratch'"),

@@ -1,0 +1,66 @@
+"""Checks the names of measures in a suite's file, as far as they are known before anything ran."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.experiments.suite import Grid, Suite
+from repdib_lightning.word_lists import words
+
+FACTOR_PROBES, PICTURE_PROBE = ("linear", "mlp"), "decoder"
+"""What ``probe --probes`` takes; written out, since the probes themselves import torch."""
+
+QUANTITIES = {**dict.fromkeys(FACTOR_PROBES, ("kept", "error")), PICTURE_PROBE: ("kept", "error", "rmse")}
+"""Probe -> last part of its measures."""
+
+
+def check_measures(suite: Suite) -> None:
+    """Check ``measures``, ``claims`` and ``headline``: their probes, agents and names of fine-tunings.
+
+    Factors, logged values and what an agent measures show only when there are results.
+
+    Raises:
+        UserError: naming file, key and the nearest name.
+    """
+    _check_probes(suite)
+    for measure in suite.measures:
+        _check(suite, "measures", measure, suite.grids)
+    for claim in suite.claims:
+        _check(suite, f"claims.{claim.text}.measure", claim.measure, [suite.grid(claim.grid)])
+    for row in suite.headline:
+        _check(suite, f"headline.{row.label}.measure", f"{row.measure}/kept", suite.grids[:1])
+
+
+def probes_of(suite: Suite) -> tuple[str, ...]:
+    """Names of the probes that every pre-trained point is read by."""
+    return words(suite.probe.get("probes", FACTOR_PROBES), f"{suite.file}: probe.probes")
+
+
+def _check_probes(suite: Suite) -> None:
+    chosen, known = probes_of(suite), (*FACTOR_PROBES, PICTURE_PROBE)
+    for name in chosen:
+        if name not in known:
+            raise UserError(f"{suite.file}: probe.probes: '{name}' is not known, {nearest(name, known)}")
+    if not set(chosen) & set(FACTOR_PROBES):
+        raise UserError(f"{suite.file}: probe.probes: one of {', '.join(FACTOR_PROBES)} is needed")
+
+
+def _check(suite: Suite, key: str, measure: str, grids: Sequence[Grid]) -> None:
+    first, _, rest = str(measure).partition("/")
+    settings = [setting for grid in grids for setting in grid.settings]
+    finetunes = [setting.finetune for setting in settings if setting.finetune is not None]
+    probed = (*probes_of(suite), "codes", "val") if any(setting.pretrained for setting in settings) else ()
+    known = {*probed, *(finetune.agent for finetune in finetunes)}
+    where = f"{suite.file}: {key}: '{measure}'"
+    if first not in known:
+        raise UserError(f"{where}: '{first}' is no probe or agent here, {nearest(first, known)}")
+    runs = {name for finetune in finetunes if finetune.agent == first for name in finetune.runs}
+    name, _, of_run = rest.partition("/")
+    if runs and name not in runs:
+        raise UserError(f"{where}: no fine-tuning is called '{name}', {nearest(name, runs)}")
+    if runs and not of_run:
+        raise UserError(f"{where}: does not say what of the fine-tuning, such as {first}/{name}/mean_return")
+    last = rest.rpartition("/")[2]
+    if first in QUANTITIES and last not in QUANTITIES[first]:
+        raise UserError(f"{where}: must end in {' or '.join(QUANTITIES[first])}, {nearest(last, QUANTITIES[first])}")
