@@ -15,6 +15,7 @@ from repdib_lightning.evaluation.report import Section, write_report
 from repdib_lightning.evaluation.samples import ProbeSamples, read_samples
 from repdib_lightning.experiments import figures, tables
 from repdib_lightning.experiments.comparison import Difference, Summary, differences, summaries
+from repdib_lightning.experiments.curve_names import check_curves
 from repdib_lightning.experiments.curves import Band, bands, finetune_bands, write_bands
 from repdib_lightning.experiments.finetune_parts import finetune_parts, training_only
 from repdib_lightning.experiments.headline import headline, verdicts
@@ -52,6 +53,7 @@ def report_suite(
     results = load_results(plan, dict.fromkeys(point.seed for point in points), runs)
     folder = output or (runs / plan.name / "report" if tune else RESULTS / plan.name)
     check_output_file(folder / "report.html", "--output", ".html")
+    check_curves(results)
     all_bands = {grid.name: bands(results, grid) | finetune_bands(results, grid) for grid in plan.grids}
     all_maps = {grid.name: mean_maps(results, grid) for grid in plan.grids}
     found = {grid.name: (summaries(results, grid), differences(results, grid)) for grid in plan.grids}

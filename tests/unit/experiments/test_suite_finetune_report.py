@@ -17,6 +17,7 @@ from repdib_lightning.errors import UserError
 from repdib_lightning.experiments import headline, maze_maps
 from repdib_lightning.experiments import report as reports
 from repdib_lightning.experiments.comparison import direction
+from repdib_lightning.experiments.curve_names import check_curves
 from repdib_lightning.experiments.curves import Band, bands, finetune_bands, read_bands, write_bands
 from repdib_lightning.experiments.figures import learning_curves_figure
 from repdib_lightning.experiments.maze_maps import MeanMaps, coverage_figure, mean_maps, read_maps, topology_figure
@@ -102,6 +103,25 @@ def made(tmp_path):
         for name in ("metrics.csv", "probe.json", "probe.npz"):
             (point / name).unlink()
     return path, tmp_path / "runs"
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("finetune_curves: [eval/sucess]", "finetune_curves: no run has logged 'eval/sucess', did you mean 'eval/succ"),
+        ("curves: [train/los]", "curves: no run has logged 'train/los', did you mean 'train/"),
+    ],
+)
+def test_a_curve_that_no_run_has_logged_is_refused_by_name(made, tmp_path, line, said):
+    path, runs = made
+    path.write_text(f"{SUITE}{line}\n")
+    with pytest.raises(UserError) as caught:
+        report_suite(path, output=tmp_path / "out", runs=runs)
+    assert said in str(caught.value) and str(path) in str(caught.value) and not (tmp_path / "out").exists()
+    # A point that is not finished may log it yet.
+    record = runs / "mazes/clean/vq/seed_1.json"
+    record.write_text(record.read_text().replace('"finished": true', '"finished": false'))
+    check_curves(load_results(read_suite(path), (0, 1), runs))
 
 
 @pytest.fixture
