@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 from repdib_lightning.data.datamodule import EpisodeDataModule
 from repdib_lightning.errors import UserError
@@ -41,10 +42,11 @@ class MazeDataModule(EpisodeDataModule):
         self.samples, self.collection_seed = samples, collection_seed
 
     def prepare_data(self) -> None:
-        """Collect the recording if there is none (some seconds)."""
+        """Collect the recording if there is none (some seconds), and say so."""
         if not self.path.exists():
             from repdib_lightning.environments.collect_maze import collect_maze  # reading does not need it
 
+            print(f"{self.path}: no such file; collecting {self.world} there", file=sys.stderr, flush=True)
             collect_maze(
                 self.path,
                 world=self.world,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 from repdib_lightning.data.datamodule import EpisodeDataModule
 
 
@@ -33,8 +35,9 @@ class RobotArmDataModule(EpisodeDataModule):
         self.samples, self.collection_seed = samples, collection_seed
 
     def prepare_data(self) -> None:
-        """Collect the recording if there is none (about two minutes on two cores)."""
+        """Collect the recording if there is none (about two minutes on two cores), and say so."""
         if not self.path.exists():
             from repdib_lightning.environments.collect import collect_robot_arm  # needs MuJoCo; reading does not
 
+            print(f"{self.path}: no such file; collecting the robot arm there", file=sys.stderr, flush=True)
             collect_robot_arm(self.path, samples=self.samples, seed=self.collection_seed)
