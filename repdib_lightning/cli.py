@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import shlex
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,6 +34,7 @@ from repdib_lightning.errors import UserError
 from repdib_lightning.export.run_export import write_model_description
 from repdib_lightning.objectives import OBJECTIVES
 from repdib_lightning.option_errors import one_line
+from repdib_lightning.quiet import quieten_lightning
 from repdib_lightning.representation import RepresentationModule
 from repdib_lightning.resuming import check_idle, check_same_data, check_unchanged
 
@@ -53,14 +52,6 @@ _DESCRIPTION = """Train a representation. Without --config this is the default r
 (3x3 cells, two cameras, 14,000 samples, collected on first use) with multi-step inverse dynamics and the RepDIB
 bottleneck (VIB, then 8 groups x 50 codes), 1,000 steps; about four minutes on two cores. Overlays change it:
 --config robot_arm --config bottleneck/none. Packaged configurations: {names}."""
-
-_HARMLESS = (
-    ".*does not have many workers.*",
-    ".*LightningCLI's args parameter.*",
-    ".*exists and is not empty.*",
-    ".*treespec.*",
-)
-"""Warnings of the libraries below that tell a user nothing."""
 
 
 class TrainingCLI(LightningCLI):
@@ -226,10 +217,7 @@ def _evaluate(verb: str, arguments: list[str]) -> int:
 
 def _prepare(arguments: list[str]) -> TrainingCLI:
     """Parse and build everything; nothing is written."""
-    for chatty in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(chatty).setLevel(logging.WARNING)
-    for harmless in _HARMLESS:
-        warnings.filterwarnings("ignore", message=harmless)
+    quieten_lightning()
     expanded = configurations.expand(arguments)
     if not any(argument.startswith("--config") for argument in expanded):
         expanded = ["--config", str(configurations.resolve(DEFAULT)), *expanded]

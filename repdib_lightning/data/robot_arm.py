@@ -14,7 +14,8 @@ class RobotArmDataModule(EpisodeDataModule):
         path: the store.
         samples: actions to record where the file has to be collected (paper: 14,000).
         collection_seed: of that recording.
-        batch_size, horizon, futures, frame_stack, views, workers, seed, resident: see :class:`EpisodeDataModule`.
+        batch_size, horizon, futures, frame_stack, views, workers, seed, resident, next_frame: see
+            :class:`EpisodeDataModule`.
     """
 
     def __init__(
@@ -30,14 +31,15 @@ class RobotArmDataModule(EpisodeDataModule):
         workers: int = 0,
         seed: int = 0,
         resident: bool = False,
+        next_frame: bool = False,
     ) -> None:
-        super().__init__(path, batch_size, horizon, futures, frame_stack, views, workers, seed, resident)
+        super().__init__(path, batch_size, horizon, futures, frame_stack, views, workers, seed, resident, next_frame)
         self.samples, self.collection_seed = samples, collection_seed
 
     def prepare_data(self) -> None:
         """Collect the recording if there is none (about two minutes on two cores), and say so."""
         if not self.path.exists():
-            from repdib_lightning.environments.collect import collect_robot_arm  # needs MuJoCo; reading does not
+            from repdib_lightning.environments.collect_robot_arm import collect_robot_arm  # needs MuJoCo
 
             print(f"{self.path}: no such file; collecting the robot arm there", file=sys.stderr, flush=True)
             collect_robot_arm(self.path, samples=self.samples, seed=self.collection_seed)

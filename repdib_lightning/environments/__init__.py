@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 COLLECTORS = {
+    "control": "repdib_lightning.environments.collect_control:collect_control",
     "maze": "repdib_lightning.environments.collect_maze:collect_maze",
-    "robot_arm": "repdib_lightning.environments.collect:collect_robot_arm",
+    "policies": "repdib_lightning.environments.train_policies:train_policies",
+    "robot_arm": "repdib_lightning.environments.collect_robot_arm:collect_robot_arm",
 }
 """Environment -> ``module:function`` that records a data set of it: ``function(path, *, seed, overwrite, ...)``."""
 
@@ -12,6 +14,7 @@ _MAZES = ("GridWorld", "SpiralWorld", "LoopWorld")
 
 GYMNASIUM_IDS = {
     **{f"repdib/{world}-v0": "repdib_lightning.environments.maze_env:MazeEnv" for world in _MAZES},
+    "repdib/Control-v0": "repdib_lightning.environments.control_env:ControlEnv",
     "repdib/RobotArm-v0": "repdib_lightning.environments.robot_arm_env:RobotArmEnv",
 }
 """Identifier for ``gymnasium.make`` -> class; see :func:`register`."""

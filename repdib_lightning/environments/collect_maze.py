@@ -11,7 +11,7 @@ import numpy as np
 
 from repdib_lightning.data.schema import FactorSpec
 from repdib_lightning.data.writer import EpisodeWriter
-from repdib_lightning.environments.collect import evaluation_episodes
+from repdib_lightning.environments.episode_workers import evaluation_episodes
 from repdib_lightning.environments.maze_batch import MazeBatch
 from repdib_lightning.environments.mazes import MOVES, Cell
 from repdib_lightning.errors import UserError

@@ -13,7 +13,7 @@ class NumberedClips:
     Args:
         source: see :mod:`repdib_lightning.environments.distractors`.
         seed: decides the split and what procedural clips look like.
-        size: height and width in pixels.
+        size: height and width in pixels, or one number for both.
         limits: clips to use at most of the training and of the evaluation split; None for all.
 
     Raises:
@@ -21,7 +21,12 @@ class NumberedClips:
     """
 
     def __init__(
-        self, source: str, seed: int, *, size: int, limits: tuple[int | None, int | None] = (None, None)
+        self,
+        source: str,
+        seed: int,
+        *,
+        size: int | tuple[int, int],
+        limits: tuple[int | None, int | None] = (None, None),
     ) -> None:
         train = Distractors.from_spec(source, "train", seed=seed, size=size, limit=limits[0])
         held_out = Distractors.from_spec(source, "evaluation", seed=seed, size=size, limit=limits[1])
@@ -36,6 +41,6 @@ class NumberedClips:
         return np.arange(train, len(self)) if evaluation else np.arange(train)
 
     def clip(self, number: int) -> np.ndarray:
-        """(T, size, size, 3) uint8."""
+        """(T, H, W, 3) uint8."""
         train = len(self._pools[0])
         return self._pools[0].clip(number) if number < train else self._pools[1].clip(number - train)

@@ -41,14 +41,14 @@ def prepare_rendering(*, threads: int | None = None) -> Any:
         UserError: ``MUJOCO_GL`` names no headless backend, MuJoCo is missing or is version 4 or later, or the backend's
             library cannot be loaded.
     """
-    backend = _backend()
+    _backend()
     if threads is not None:
         os.environ.setdefault("LP_NUM_THREADS", str(threads))
     _import_triton_first()
     try:
         mujoco = importlib.import_module("mujoco")
     except (ImportError, AttributeError) as error:
-        raise _no_renderer(backend, error) from error
+        raise no_renderer(error) from error
     _check_version(mujoco.__version__)
     return mujoco
 
@@ -79,7 +79,9 @@ def _check_version(version: str) -> None:
         )
 
 
-def _no_renderer(backend: str, error: BaseException) -> UserError:
+def no_renderer(error: BaseException) -> UserError:
+    """Say that the chosen backend cannot be used, and where to get one."""
+    backend = os.environ.get("MUJOCO_GL", DEFAULT_BACKEND)
     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
     return UserError(f"MUJOCO_GL={backend}: cannot render ({reason}); {SOFTWARE_HINT}")
 
@@ -89,7 +91,7 @@ def _open_context(backend: str, height: int, width: int) -> Any:
     try:
         return importlib.import_module(BACKENDS[backend]).GLContext(width, height)
     except (ImportError, AttributeError, RuntimeError, OSError) as error:
-        raise _no_renderer(backend, error) from error
+        raise no_renderer(error) from error
 
 
 def fast_quality(model: Any, height: int, width: int) -> None:
@@ -113,12 +115,13 @@ class SceneRenderer:
     Args:
         model: a compiled ``MjModel``; see :func:`fast_quality`.
         height, width: size of the pictures in pixels.
+        effects: draw shadows and reflections, where the model has them.
 
     Raises:
         UserError: no OpenGL backend can be opened.
     """
 
-    def __init__(self, model: Any, height: int, width: int) -> None:
+    def __init__(self, model: Any, height: int, width: int, *, effects: bool = False) -> None:
         self._context: Any = None
         self._resources: Any = None
         self._mujoco = prepare_rendering()
@@ -136,7 +139,7 @@ class SceneRenderer:
         self._camera.type = self._mujoco.mjtCamera.mjCAMERA_FIXED
         self._rectangle = self._mujoco.MjrRect(0, 0, width, height)
         flags = self._mujoco.mjtRndFlag
-        self._scene.flags[flags.mjRND_SHADOW] = self._scene.flags[flags.mjRND_REFLECTION] = 0
+        self._scene.flags[flags.mjRND_SHADOW] = self._scene.flags[flags.mjRND_REFLECTION] = int(effects)
         self._geom_of_segment = np.empty(0, dtype=np.int64)
         self._segment_flags = [int(flags.mjRND_SEGMENT), int(flags.mjRND_IDCOLOR)]
 
@@ -145,14 +148,23 @@ class SceneRenderer:
         self._context.make_current()
         self._mujoco.mjr_uploadTexture(self.model, self._resources, texture)
 
-    def picture(self, data: Any, camera: int) -> np.ndarray:
-        """(H, W, 3) uint8: the scene in ``data`` seen from a camera of the model."""
-        self._aim(data, camera)
+    def picture(self, data: Any, camera: int, model: Any = None) -> np.ndarray:
+        """(H, W, 3) uint8: the scene in ``data`` seen from a camera of the model.
+
+        Args:
+            data: of the renderer's model, or of ``model``.
+            camera: its number.
+            model: one that was compiled from the same source, with other values; the renderer's own by default.
+        """
+        self._aim(data, camera, model)
         return self._draw()
 
-    def picture_and_geoms(self, data: Any, camera: int) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, 3) uint8 picture, and (H, W) int64: the geom seen at each pixel, -1 where there is none."""
-        self._aim(data, camera)
+    def picture_and_geoms(self, data: Any, camera: int, model: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W, 3) uint8 picture, and (H, W) int64: the geom seen at each pixel, -1 where there is none.
+
+        Takes what :meth:`picture` takes.
+        """
+        self._aim(data, camera, model)
         picture = self._draw()
         self._scene.flags[self._segment_flags] = 1
         identity = self._draw().astype(np.int64)
@@ -171,10 +183,11 @@ class SceneRenderer:
                 lookup[geom.segid + 1] = geom.objid
         return lookup
 
-    def _aim(self, data: Any, camera: int) -> None:
+    def _aim(self, data: Any, camera: int, model: Any) -> None:
         self._camera.fixedcamid = camera
         everything = self._mujoco.mjtCatBit.mjCAT_ALL.value
-        self._mujoco.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
+        model = self.model if model is None else model
+        self._mujoco.mjv_updateScene(model, data, self._options, None, self._camera, everything, self._scene)
 
     def _draw(self) -> np.ndarray:
         pixels = np.empty((self.height, self.width, 3), dtype=np.uint8)

@@ -1,11 +1,19 @@
-"""Reinforcement learning on exported encoders, with Stable-Baselines3's algorithms."""
+"""Reinforcement learning on exported encoders: online with Stable-Baselines3's algorithms, offline with our own."""
 
 from __future__ import annotations
 
-AGENTS = {"dqn": "repdib_lightning.rl.finetune_dqn:finetune_dqn"}
+AGENTS = {
+    "bc": "repdib_lightning.rl.finetune_offline:finetune_bc",
+    "dqn": "repdib_lightning.rl.finetune_dqn:finetune_dqn",
+    "td3bc": "repdib_lightning.rl.finetune_offline:finetune_td3bc",
+}
 """Agent -> ``module:function`` behind ``finetune AGENT``."""
 
-CHECKS = {"dqn": "repdib_lightning.rl.finetune_dqn:check_dqn"}
+CHECKS = {
+    "bc": "repdib_lightning.rl.finetune_offline:check_bc",
+    "dqn": "repdib_lightning.rl.finetune_dqn:check_dqn",
+    "td3bc": "repdib_lightning.rl.finetune_offline:check_td3bc",
+}
 """Agent -> ``module:function`` that takes the same options and raises UserError for what is wrong with them, as far as
 that can be known without a bundle and before anything runs."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -13,7 +12,7 @@ from torch import nn
 from repdib_lightning.bottlenecks import Identity
 from repdib_lightning.encoders import ConvolutionalEncoder
 from repdib_lightning.errors import UserError
-from repdib_lightning.export.description import CONFIG, bundle_config
+from repdib_lightning.export.description import bundle_config
 from repdib_lightning.export.frozen import FrozenEncoder
 from repdib_lightning.records import ArraySpec, DataSpec
 from repdib_lightning.rl.features import BottleneckFeatures
@@ -70,22 +69,3 @@ def _channels_first(space: gymnasium.Space[Any]) -> tuple[int, ...]:
     """Channels are the smallest side, the first one where two are as small."""
     shape = tuple(space.shape or ())
     return shape if shape[0] <= shape[2] else (shape[2], *shape[:2])
-
-
-def checked_bundle(path: Path | None) -> Path | None:
-    """A bundle's folder; of a run's folder, the bundle in it.
-
-    Raises:
-        UserError: neither, with the command that exports one.
-    """
-    if path is None:
-        return None
-    inside = path / "bundle"
-    found = inside if inside.is_dir() else path
-    if not (found / CONFIG).is_file():
-        what = "holds no bundle" if path.is_dir() else "is a file, a bundle is a folder" if path.exists() else ""
-        run = path if (path / "checkpoints").is_dir() else "RUN"
-        raise UserError(
-            f"--encoder {path}: {what or 'no such bundle'}; export one: python -m repdib_lightning export {run}"
-        )
-    return found

@@ -10,7 +10,7 @@ from typing import Any
 from repdib_lightning.errors import UserError
 from repdib_lightning.rl import FRESH_OPTIONS
 
-CONFIGURATION, OUTCOME = "finetune.json", "outcome.json"
+CONFIGURATION, PROGRESS, OUTCOME = "finetune.json", "progress.csv", "outcome.json"
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,10 @@ from tqdm import tqdm
 from repdib_lightning.evaluation.coverage import covered, visitation_entropy
 from repdib_lightning.rl.evaluation import Act, EpisodeEvaluation, MazeEvaluation
 from repdib_lightning.rl.features import BottleneckFeatures
+from repdib_lightning.rl.options import PROGRESS
 from repdib_lightning.rl.visits import CountVisits
 
-PROGRESS, POLICY = "progress.csv", "policy.zip"
+POLICY = "policy.zip"
 _SHOWN = ("eval/return", "eval/success", "train/coverage")
 
 

@@ -23,10 +23,11 @@ from repdib_lightning.records import DataSpec
 from repdib_lightning.rl import FRESH_OPTIONS
 from repdib_lightning.rl.devices import check_device
 from repdib_lightning.rl.dqn import BottleneckDQN
-from repdib_lightning.rl.encoders import checked_bundle, fresh_description, load_into
+from repdib_lightning.rl.encoders import fresh_description, load_into
 from repdib_lightning.rl.environment import check_discrete, maze_of, open_environment
 from repdib_lightning.rl.evaluation import EpisodeEvaluation, MazeEvaluation
 from repdib_lightning.rl.features import BottleneckFeatures
+from repdib_lightning.rl.given_bundle import checked_bundle
 from repdib_lightning.rl.options import CONFIGURATION, OUTCOME, DQNOptions, plain
 from repdib_lightning.rl.progress import POLICY, Progress
 from repdib_lightning.rl.visits import CountVisits

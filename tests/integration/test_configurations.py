@@ -17,7 +17,7 @@ from killing import command_in_processes
 
 from repdib_lightning.__main__ import VERBS, main
 from repdib_lightning.configurations import packaged, packaged_suites
-from repdib_lightning.environments.collect import collect_robot_arm
+from repdib_lightning.environments.collect_robot_arm import collect_robot_arm
 from repdib_lightning.environments.collect_maze import collect_maze
 from repdib_lightning.experiments.suite_file import read_suite
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from repdib_lightning.data.episodes import EpisodeStore
-from repdib_lightning.environments.collect import RobotArmRecording, collect_robot_arm, record_episode
+from repdib_lightning.environments.collect_robot_arm import RobotArmRecording, collect_robot_arm, record_episode
 from repdib_lightning.environments.robot_arm import Television, move
 from repdib_lightning.environments.robot_arm_scene import Moment, RobotArmScene
 from repdib_lightning.errors import UserError
@@ -148,7 +148,7 @@ def test_a_workers_error_reaches_the_caller_and_leaves_no_file(tmp_path):
 def test_interrupted_script_without_main_guard_leaves_nothing(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "from repdib_lightning.environments.collect import collect_robot_arm\n"
+        "from repdib_lightning.environments.collect_robot_arm import collect_robot_arm\n"
         "print('started', flush=True)\n"
         "collect_robot_arm('out/x.h5', samples=100_000, episode_length=5, image_size=16, workers=1)\n"
     )

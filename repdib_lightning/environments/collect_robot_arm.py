@@ -1,21 +1,17 @@
-"""Makes data sets: plays a random policy in worker processes and writes one store."""
+"""Makes data sets of the robot arm: plays a random policy in worker processes and writes one store."""
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from multiprocessing.connection import Connection, wait
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from repdib_lightning.data.writer import EpisodeWriter
-from repdib_lightning.environments import COLLECTORS as COLLECTORS
+from repdib_lightning.environments.episode_workers import evaluation_episodes, recorded_in_order
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import ActionSpec, ArraySpec
 
@@ -23,7 +19,6 @@ if TYPE_CHECKING:
     from repdib_lightning.environments.robot_arm import Television
     from repdib_lightning.environments.robot_arm_scene import RobotArmScene
 
-EVALUATION_SHARE = 0.3
 _CAMERAS = ("front", "top")
 
 
@@ -67,19 +62,17 @@ class RobotArmRecording:
         """How many actions an episode has."""
         return min(self.episode_length, self.samples - episode * self.episode_length)
 
+    def open(self) -> Callable[[int], dict[str, Any]]:
+        """Open the scene in this process: a function that renders an episode."""
+        from repdib_lightning.environments.robot_arm import Television
+        from repdib_lightning.environments.robot_arm_scene import RobotArmScene
+
+        scene, television = RobotArmScene(self.image_size), Television(self.distractors, self.seed)
+        return partial(record_episode, self, scene=scene, television=television)
+
     def evaluation_episodes(self) -> set[int]:
         """Which episodes are never trained on; see :func:`evaluation_episodes`."""
         return evaluation_episodes(self.episodes)
-
-
-def evaluation_episodes(episodes: int) -> set[int]:
-    """Which of the episodes of a recording are never trained on: about 30 %, spread evenly.
-
-    Of few episodes up to half, so that there are 4 where possible: probes are fitted on half of them and scored on the
-    other half.
-    """
-    count = max(min(4, episodes // 2), round(EVALUATION_SHARE * episodes)) if episodes > 1 else 0
-    return {int((i + 0.5) * episodes / count) for i in range(count)}
 
 
 def collect_robot_arm(
@@ -142,7 +135,7 @@ def collect_robot_arm(
         overwrite=overwrite,
     )
     with writer, _progress_bar(samples, progress) as bar:
-        for episode in _rendered_in_order(recording, min(workers, recording.episodes)):
+        for episode in recorded_in_order(recording, range(recording.episodes), workers):
             writer.add_episode(**episode)
             bar.update(len(episode["actions"]))
     return Path(path)
@@ -171,89 +164,6 @@ def record_episode(
         "masks": {name: np.stack([masks[name] for _, masks in seen]) for name in _CAMERAS},
         "evaluation": evaluation,
     }
-
-
-def _serve(connection: Connection, recording: RobotArmRecording) -> None:
-    """A worker: receives episode numbers, sends back (number, episode) or (number, exception)."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
-    try:
-        from repdib_lightning.environments.rendering import prepare_rendering
-        from repdib_lightning.environments.robot_arm import Television
-        from repdib_lightning.environments.robot_arm_scene import RobotArmScene
-
-        prepare_rendering(threads=0)
-        scene = RobotArmScene(recording.image_size)
-        television = Television(recording.distractors, recording.seed)
-        while (episode := connection.recv()) is not None:
-            connection.send((episode, record_episode(recording, episode, scene, television)))
-    except (EOFError, BrokenPipeError):
-        return  # the parent is gone
-    except Exception as error:
-        connection.send((-1, UserError(str(error)) if isinstance(error, UserError) else RuntimeError(repr(error))))
-
-
-def _rendered_in_order(recording: RobotArmRecording, workers: int) -> Iterator[dict[str, Any]]:
-    """Episodes in order; at most two a worker are under way or waiting, so memory stays bounded."""
-    with _worker_connections(recording, workers) as connections:
-        waiting: dict[int, dict[str, Any]] = {}
-        idle: list[Any] = list(connections)
-        given = 0
-        for wanted in range(recording.episodes):
-            while wanted not in waiting:
-                while idle and given < min(recording.episodes, wanted + 2 * workers):
-                    idle.pop().send(given)
-                    given += 1
-                for connection in wait([c for c in connections if c not in idle]):
-                    episode, result = _receive(connection)
-                    waiting[episode] = result
-                    idle.append(connection)
-            yield waiting.pop(wanted)
-
-
-def _receive(connection: Any) -> tuple[int, dict[str, Any]]:
-    try:
-        episode, result = connection.recv()
-    except EOFError as error:
-        raise RuntimeError("a rendering process died (out of memory, or a fault of the graphics driver)") from error
-    if isinstance(result, Exception):
-        raise result
-    return episode, result
-
-
-@contextmanager
-def _worker_connections(recording: RobotArmRecording, workers: int) -> Iterator[list[Any]]:
-    context = multiprocessing.get_context("spawn")
-    connections: list[Any] = []
-    processes = []
-    try:
-        with _main_not_imported_again():
-            for _ in range(workers):
-                ours, theirs = context.Pipe()
-                process = context.Process(target=_serve, args=(theirs, recording), daemon=True)
-                process.start()
-                theirs.close()
-                connections.append(ours)
-                processes.append(process)
-        yield connections
-    finally:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.join()
-        for connection in connections:
-            connection.close()
-
-
-@contextmanager
-def _main_not_imported_again() -> Iterator[None]:
-    """Hide the main script from spawned processes: they need only this package, and scripts may lack a main guard."""
-    main = sys.modules["__main__"]
-    hidden: dict[str, Any] = {name: vars(main).pop(name) for name in ("__file__", "__spec__") if name in vars(main)}
-    main.__spec__ = None
-    try:
-        yield
-    finally:
-        vars(main).update(hidden)
 
 
 def _progress_bar(samples: int, shown: bool) -> Any:

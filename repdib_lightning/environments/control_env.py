@@ -1,0 +1,96 @@
+"""The Control Suite from pixels, amid distractors, as a gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from repdib_lightning.environments.control_background import Backgrounds, Playing
+from repdib_lightning.environments.control_background import Kind as Distractors
+from repdib_lightning.environments.control_scene import ControlCamera, Place, Quality
+from repdib_lightning.environments.control_task import ControlTask
+from repdib_lightning.errors import UserError
+
+
+class ControlEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """A task of the DeepMind Control Suite, filmed by its own camera (paper, offline visual control).
+
+    Observations: (3, H, W) uint8, not stacked; W is half as much wider with a distractor at the side. Actions: (A,)
+    float32 in [-1, 1]. Rewards are summed over the action repeat: a return is between 0 and 1000. Episodes are
+    truncated after 1000 control steps. ``info["factors"]`` holds the ground truth: what the task observes of its state,
+    and what plays behind.
+
+    Args:
+        task: such as ``walker-walk``.
+        image_size: height of the picture in pixels (64 and 84 are usual), 16 to 512.
+        action_repeat: control steps an action is held for.
+        quality: ``fast`` or ``paper``; see :class:`~repdib_lightning.environments.control_scene.ControlCamera`.
+        distractors: ``none``, ``image`` (another one each episode) or ``video`` (another one each episode, playing).
+        place: ``sky``, ``sky_floor`` or ``side``.
+        source: of the distractors: built in, a folder of pictures or videos, or of CIFAR-10; see
+            :mod:`repdib_lightning.environments.distractors`. Empty for the built-in one.
+        distractor_seed: decides which clips are held out, and what built-in ones look like.
+        evaluation: show held-out clips instead of the training ones.
+        render_mode: ``rgb_array`` or None.
+
+    Raises:
+        UserError: an argument out of range, unreadable distractors, MuJoCo 4, or no renderer.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (gymnasium's own convention)
+
+    def __init__(
+        self,
+        task: str = "walker-walk",
+        *,
+        image_size: int = 64,
+        action_repeat: int = 2,
+        quality: Quality = "fast",
+        distractors: Distractors = "none",
+        place: Place = "sky",
+        source: str = "",
+        distractor_seed: int = 0,
+        evaluation: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise UserError(f"render_mode={render_mode}: must be rgb_array or None")
+        self.render_mode, self.evaluation = render_mode, evaluation
+        self.task = ControlTask(task, action_repeat)
+        self.backgrounds = Backgrounds(distractors, place, source, distractor_seed, image_size)
+        self.camera = ControlCamera(self.task, image_size, quality, self.backgrounds.through)
+        shape = (3, image_size, image_size + self.backgrounds.panel)
+        self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.task.actions,), np.float32)
+        self._playing, self._step = Playing(0, 0), 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode, with another distractor."""
+        super().reset(seed=seed)
+        self.task.reset(self.np_random)
+        self._playing, self._step = self.backgrounds.draw(self.np_random, self.evaluation), 0
+        return self._observe(), self._info()
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Hold an action for the action repeat."""
+        reward, terminated, truncated = self.task.step(action)
+        self._step += 1
+        return self._observe(), reward, terminated, truncated, self._info()
+
+    def _observe(self) -> np.ndarray:
+        return self.backgrounds.shown(self.camera.see(self.task), self._playing, self._step)
+
+    def _info(self) -> dict[str, Any]:
+        return {"factors": {**self.task.factors(), **self.backgrounds.factors(self._playing, self._step)}}
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """(H, W, 3) uint8: the observation; None without ``render_mode="rgb_array"``."""
+        return None if self.render_mode is None else self._observe().transpose(1, 2, 0)
+
+    def close(self) -> None:
+        """Free the graphics memory."""
+        self.camera.close()

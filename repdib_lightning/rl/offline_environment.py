@@ -1,0 +1,84 @@
+"""The environment in which an offline agent is evaluated: by default the one its data were recorded in."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+
+from repdib_lightning.data.episodes import EpisodeStore
+from repdib_lightning.errors import UserError
+from repdib_lightning.rl.environment import open_environment
+from repdib_lightning.rl.offline_options import NO_ENVIRONMENT
+
+CONTROL = "repdib/Control-v0"
+_VD4RL = "dm_control/"
+
+_FIXED = ("task", "action_repeat", "image_size")
+"""Of a recording; evaluated otherwise, its return would be that of another problem."""
+
+_TAKEN = (*_FIXED, "quality", "distractors", "place", "source")
+
+
+def evaluated_environment(
+    store: EpisodeStore, env: str, options: Mapping[str, Any]
+) -> tuple[str, dict[str, Any]] | None:
+    """Which environment to open, and its options; None for no evaluation.
+
+    Args:
+        store: the data. env: a gymnasium id, ``none``, or empty for the data's own. options: over the data's own.
+
+    Raises:
+        UserError: the data do not tell where they were recorded, or an option that differs from what they were
+            recorded with.
+    """
+    if env == NO_ENVIRONMENT:
+        if options:
+            raise UserError("--env_options mean nothing with --env none; leave one of them out")
+        return None
+    recorded = recorded_options(store)
+    if env and env != CONTROL:
+        return env, dict(options)
+    if recorded is None:
+        raise UserError(
+            f"{store.path}: does not tell in which environment it was recorded; name one with --env, or train without "
+            "evaluation with --env none"
+        )
+    for name in _FIXED:
+        if name in options and name in recorded and options[name] != recorded[name]:
+            raise UserError(
+                f"--env_options.{name} {options[name]}: {store.path} was recorded with {recorded[name]}; leave it out, "
+                "or collect other data"
+            )
+    return CONTROL, {**recorded, **options, "evaluation": options.get("evaluation", True)}
+
+
+def recorded_options(store: EpisodeStore) -> dict[str, Any] | None:
+    """Options of :class:`ControlEnv` that a store of the Control Suite was recorded with; None for any other."""
+    environment = str(store.attributes.get("environment", ""))
+    if environment == "control":
+        configuration = json.loads(store.attributes["configuration"])
+        found = {name: configuration[name] for name in _TAKEN}
+        return {**found, "distractor_seed": configuration["seed"]}
+    if environment.startswith(_VD4RL):
+        shape = next(iter(store.observations.values())).shape
+        task = environment.removeprefix(_VD4RL)
+        return {"task": task, "action_repeat": 2, "image_size": shape[-1], "quality": "paper"}
+    return None
+
+
+def open_all(name: str, options: Mapping[str, Any], count: int, actions: int) -> list[gymnasium.Env[Any, Any]]:
+    """Open copies of an environment.
+
+    Raises:
+        UserError: no such environment, bad options, or other actions than the data's.
+    """
+    opened: list[gymnasium.Env[Any, Any]] = []
+    for _ in range(count):
+        opened.append(open_environment(name, options))
+        space = opened[0].action_space
+        if not isinstance(space, gymnasium.spaces.Box) or space.shape != (actions,):
+            raise UserError(f"--env {name}: its actions are {space}, those of the data are continuous, {actions} wide")
+    return opened

@@ -1,0 +1,76 @@
+"""The options of the offline agents, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from repdib_lightning.errors import UserError
+
+NO_ENVIRONMENT = "none"
+FRESH = {"features": 256, "channels": 32, "strides": [2, 1, 1, 1], "frame_stack": 3}
+"""Of an encoder that is trained by the agent (DrQ-v2), unless chosen; they mean nothing beside one that is given."""
+
+
+@dataclass(frozen=True)
+class OfflineOptions:
+    """Described in :mod:`repdib_lightning.rl.finetune_offline`, which has the defaults. ``values`` holds what only
+    TD3+BC takes: alpha, tau, noise, noise_clip."""
+
+    agent: str
+    data: Path
+    encoder: Path | None
+    env: str
+    env_options: dict[str, Any] | None
+    steps: int
+    seed: int
+    learning_rate: float
+    batch_size: int
+    hidden: int
+    copies: int
+    shift: int
+    features: int | None
+    channels: int | None
+    strides: list[int] | None
+    frame_stack: int | None
+    evaluate_every: int
+    episodes: int
+    film: int
+    device: str
+    gamma: float = 0.99
+    n_steps: int = 1
+    values: Mapping[str, float] | None = None
+
+    def fresh(self, name: str) -> Any:
+        """An option of a fresh encoder."""
+        chosen = getattr(self, name)
+        return FRESH[name] if chosen is None else chosen
+
+
+def check_offline_options(options: OfflineOptions) -> None:
+    """Raise UserError for a number out of range, or options that exclude each other."""
+    for name in ("steps", "batch_size", "hidden", "copies", "evaluate_every", "episodes", "n_steps"):
+        if getattr(options, name) < 1:
+            raise UserError(f"--{name} must be at least 1, is {getattr(options, name)}")
+    for name in ("seed", "shift", "film"):
+        if not 0 <= getattr(options, name) < 2**32:
+            raise UserError(f"--{name} must be from 0 to {2**32 - 1}, is {getattr(options, name)}")
+    if not options.learning_rate > 0.0:
+        raise UserError(f"--learning_rate must be above 0, is {options.learning_rate}")
+    if not 0.0 <= options.gamma <= 1.0:
+        raise UserError(f"--gamma must be in [0, 1], is {options.gamma}")
+    values = options.values or {}
+    for name in ("alpha", "noise", "noise_clip"):
+        if not values.get(name, 0.0) >= 0.0:
+            raise UserError(f"--{name} must not be negative, is {values[name]}")
+    if not 0.0 < values.get("tau", 1.0) <= 1.0:
+        raise UserError(f"--tau must be above 0 and at most 1, is {values['tau']}")
+    for name in FRESH:
+        if options.encoder is not None and getattr(options, name) is not None:
+            raise UserError(f"--{name} is of an encoder that the agent trains; leave it out beside --encoder")
+    if options.encoder is None and options.copies > 1:
+        raise UserError("--copies are of frames that a given encoder encodes once; leave it out without --encoder")
+    if options.film > options.episodes:
+        raise UserError(f"--film {options.film}: must be at most --episodes {options.episodes}")

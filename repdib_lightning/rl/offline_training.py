@@ -1,0 +1,179 @@
+"""One training of an offline agent, from a store to its outcome."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import numpy as np
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from repdib_lightning.bottlenecks import Identity
+from repdib_lightning.data.episodes import EpisodeStore
+from repdib_lightning.data.files import whole_file
+from repdib_lightning.encoders import ConvolutionalEncoder
+from repdib_lightning.errors import UserError
+from repdib_lightning.evaluation.features import check_compatible, resolve_device, stacked
+from repdib_lightning.export.bundle import save_bundle
+from repdib_lightning.export.load import load_encoder
+from repdib_lightning.records import DataSpec
+from repdib_lightning.rl.episodes_at_once import EpisodesAtOnce
+from repdib_lightning.rl.film import side_by_side, write_film
+from repdib_lightning.rl.given_bundle import checked_bundle
+from repdib_lightning.rl.networks import ShiftedPictures, StandardisedLatents
+from repdib_lightning.rl.offline_environment import evaluated_environment, open_all
+from repdib_lightning.rl.offline_options import OfflineOptions
+from repdib_lightning.rl.offline_progress import OfflineProgress
+from repdib_lightning.rl.options import CONFIGURATION, OUTCOME, plain
+from repdib_lightning.rl.policy_file import save_policy
+from repdib_lightning.rl.row_sources import Latents, Pictures
+from repdib_lightning.rl.td3_bc import TD3BC, BehaviourCloning
+from repdib_lightning.rl.transitions import TransitionBatches, Transitions
+from repdib_lightning.versions import versions
+
+FILM = "evaluation.mp4"
+
+
+class OfflineTraining:
+    """Builds everything, so that whatever does not fit shows before a folder is made.
+
+    Args:
+        options: of the verb.
+
+    Raises:
+        UserError: a store without what is needed, a bundle that does not fit it, an environment that is not there or
+            does not fit, a device that is not there.
+    """
+
+    def __init__(self, options: OfflineOptions) -> None:
+        self.options = options
+        self.device = resolve_device(options.device)
+        self.store = EpisodeStore(options.data)
+        rewarded = options.agent != "bc"
+        self.transitions = Transitions(self.store, n_steps=options.n_steps, gamma=options.gamma, rewarded=rewarded)
+        bundle = checked_bundle(options.encoder)
+        self.frozen = None if bundle is None else load_encoder(bundle).to(self.device)
+        self.spec = self._fresh_spec() if self.frozen is None else self.frozen.spec
+        if self.frozen is not None:
+            check_compatible(self.frozen, self.store, str(options.encoder))
+        self.evaluation = self._open_evaluation()
+
+    def _fresh_spec(self) -> DataSpec:
+        stack = self.options.fresh("frame_stack")
+        pictures = {name: stacked(a, stack) for name, a in self.store.observations.items() if a.is_image}
+        return DataSpec(pictures, self.store.actions_spec, stack)
+
+    def _open_evaluation(self) -> EpisodesAtOnce | None:
+        options = self.options
+        chosen = evaluated_environment(self.store, options.env, options.env_options or {})
+        if chosen is None:
+            return None
+        assert self.store.actions_spec is not None
+        copies = open_all(*chosen, options.episodes, self.store.actions_spec.size)
+        try:
+            return EpisodesAtOnce(copies, self.spec, options.seed + 1)
+        except UserError as error:
+            raise UserError(f"--encoder {options.encoder}: does not fit --env {chosen[0]}: {error}") from error
+
+    def build(self) -> BehaviourCloning:
+        """The agent, with its encoder or standardiser; encodes the data where the encoder is frozen."""
+        options = self.options
+        torch.manual_seed(options.seed)
+        features: StandardisedLatents | ShiftedPictures
+        if self.frozen is None:
+            encoder = ConvolutionalEncoder(
+                self.spec, **{name: options.fresh(name) for name in ("features", "channels", "strides")}
+            )
+            self.source: Latents | Pictures = Pictures(self.store, self.spec)
+            features, width = ShiftedPictures(encoder, options.shift), encoder.features
+        else:
+            shifts = {"copies": options.copies, "shift": options.shift, "seed": options.seed}
+            self.source = latents = Latents(self.store, self.frozen, **shifts, progress=sys.stderr.isatty())
+            features, width = StandardisedLatents(latents.mean, latents.deviation), self.frozen.features
+        assert self.store.actions_spec is not None
+        sizes: dict[str, Any] = {"hidden": options.hidden, "learning_rate": options.learning_rate}
+        torch.manual_seed(options.seed)
+        if options.agent == "bc":
+            return BehaviourCloning(features, width, self.store.actions_spec.size, **sizes)
+        sizes |= options.values or {}
+        return TD3BC(features, width, self.store.actions_spec.size, **sizes)
+
+    def act(self, observations: dict[str, np.ndarray]) -> np.ndarray:
+        """Actions (n, A) of the mean policy for name -> (n, *shape)."""
+        with torch.inference_mode():
+            if self.frozen is not None:
+                seen: Any = self.frozen.encode(observations)
+            else:
+                seen = {name: torch.from_numpy(array).to(self.agent.device) for name, array in observations.items()}
+            acted: np.ndarray = self.agent.act(seen).cpu().numpy()
+        return acted
+
+    def train(self, folder: Path) -> None:
+        """Learn; progress goes into the folder."""
+        options = self.options
+        with whole_file(folder / CONFIGURATION) as path:
+            path.write_text(json.dumps(plain(asdict(options)), indent=1) + "\n")
+        self.agent = self.build()
+        batches = TransitionBatches(
+            self.store, self.transitions, self.source, options.batch_size, options.steps, options.seed
+        )
+        evaluate = None if self.evaluation is None else partial(self._evaluate, folder, self.evaluation)
+        self.progress = OfflineProgress(folder, options.evaluate_every, options.steps, evaluate)
+        trainer = pl.Trainer(
+            max_epochs=1,
+            limit_train_batches=options.steps,
+            accelerator="cpu" if self.device.type == "cpu" else self.device.type,
+            devices=1,
+            logger=TensorBoardLogger(folder, name="", version=""),
+            callbacks=[self.progress],
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
+        trainer.fit(self.agent, train_dataloaders=batches)
+        self.agent.eval().to(self.device)
+
+    def _evaluate(self, folder: Path, evaluation: EpisodesAtOnce, last: bool) -> np.ndarray:
+        """Returns (n,); the last time, some of the episodes are filmed."""
+        returns, films = evaluation.run(self.act, self.options.film if last else 0)
+        if films:
+            write_film(folder / FILM, side_by_side(films))
+        return returns
+
+    def finish(self, folder: Path) -> dict[str, Any]:
+        """Save the trained policy, and write what was reached; returns it."""
+        save_policy(folder, self.agent.actor, self.agent.features, self.options)
+        if isinstance(self.agent.features, ShiftedPictures):
+            encoder = self.agent.features.encoder
+            training = {"agent": self.options.agent, "steps": self.options.steps}
+            save_bundle(folder / "bundle", encoder.cpu(), Identity(encoder.features), training=training, data={})
+            encoder.to(self.device)
+        measures: dict[str, float] = {}
+        if self.evaluation is not None:
+            returns, curve = self.progress.returns, self.progress.curve("eval/return")
+            measures = {
+                "return": float(returns.mean()),
+                "normalised": float(returns.mean() / 10.0),
+                "return_deviation": float(returns.std()),
+                "mean_return": float(curve.mean()),
+            }
+            self.evaluation.close()
+        measures["clone_error"] = float(self.progress.curve("train/clone")[-1])
+        outcome = {
+            "agent": self.options.agent,
+            "environment": self.options.env or str(self.store.attributes.get("environment", "")),
+            "versions": versions(),
+            "configuration": plain(asdict(self.options)),
+            "data": {"file": self.store.path.name, "fingerprint": self.store.fingerprint},
+            "measures": measures,
+            "maps": {},
+        }
+        with whole_file(folder / OUTCOME) as path:
+            path.write_text(json.dumps(outcome, indent=1, allow_nan=False) + "\n")
+        return outcome
