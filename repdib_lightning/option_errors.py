@@ -28,9 +28,12 @@ def one_line(error: BaseException, options: Iterable[str], classes: dict[str, li
         inside = [name.removeprefix(match[1] + ".") for name in known if name.startswith(match[1] + ".")]
         return UserError(f"unknown key {match[1]}.{match[2]}, {nearest(match[2], {i.split('.')[0] for i in inside})}")
     if match := re.search(r"Option '([^']+)' is not accepted", text):
-        return UserError(f"unknown key {key}.{match[1]}, {nearest(match[1], _accepted(text))}")
+        return _not_accepted(key, match[1], text)
     if match := re.search(r"Expected a dot import path string: (\S+)", text):
-        return UserError(f"{key}: unknown class '{match[1]}', {nearest(match[1], classes.get(keys[0], []))}")
+        name = match[1].rstrip(".")
+        return UserError(f"{key}: unknown class '{name}', {nearest(name, classes.get(keys[0], []))}")
+    if match := re.search(r"Expected an import path or a subclass spec, but got (.*?)\. Got value", text):
+        return UserError(f"{key}: expected a class, got '{match[1]}', {nearest(match[1], classes.get(keys[0], []))}")
     if match := re.search(r"Expected an? (?:<class ')?([\w.]+)'?>?\. Got value: (.*)", text):
         return UserError(f"{key}: expected {match[1]}, got '{match[2].split(' Got value')[0].strip().rstrip('.')}'")
     plain = re.search(r"Subtypes: \[((?:<class '(?:int|float|str|bool|NoneType)'>(?:, )?)+)\]", text)
@@ -58,15 +61,26 @@ def _nearest_option(given: str, known: list[str]) -> str:
     return hint.split("? ")[0].replace("did you mean '", "did you mean '--") + "?" if "? " in hint else hint
 
 
+def _not_accepted(key: str, option: str, text: str) -> UserError:
+    accepted = _accepted(text)
+    if not accepted and option == "class_path":
+        return UserError(f"{key}: options of a class belong under its init_args")
+    if not accepted:  # an item of a list without a class_path, which the parser takes for options of the base class
+        option, accepted = option.split(".")[0], ["class_path", "init_args"]
+    return UserError(f"unknown key {key}.{option}, {nearest(option, accepted)}")
+
+
 def _accepted(text: str) -> list[str]:
+    """Options of the class that the parser speaks of; none for a base class, which takes anything."""
     match = re.search(r"class_path='?([\w.]+)", text) or re.search(r"class_path '([\w.]+)'", text)
     if match is None:
         return []
     module, _, name = match[1].rpartition(".")
     signature = inspect.signature(getattr(importlib.import_module(module), name))
-    return [word for word in signature.parameters if word not in ("spec", "width", "params")]
+    return [word for word in signature.parameters if word not in ("spec", "width", "params", "args", "kwargs")]
 
 
 def _unwrap(text: str) -> str:
+    text = text.split(". Got value: Namespace(")[0]
     lines = [line.strip(" -") for line in text.splitlines() if line.strip()]
     return re.sub(r"Parser key \"[^\"]+\":\s*", "", lines[0] if len(lines) == 1 else " ".join(lines[:3]))

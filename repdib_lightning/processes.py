@@ -5,8 +5,11 @@ A quantiser may be built before or after the process group, so nothing here is r
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, distributed
+from torch.autograd.function import once_differentiable
 
 
 def several_processes() -> bool:
@@ -74,3 +77,40 @@ def pick_rows(rows: Tensor, wanted: Tensor) -> Tensor:
     held = (here >= 0) & (here < len(rows))
     picked = rows[here.clamp(0, len(rows) - 1)].masked_fill(~held.view(-1, *[1] * (rows.ndim - 1)), 0.0)
     return sum_over_processes(picked)
+
+
+def gather_with_gradients(rows: Tensor, *, equal: bool) -> tuple[Tensor, Tensor]:
+    """Rows (B, ...) of all processes in their order, (N, ...), and where this one's stand among them, (B,) int64.
+
+    Gradients reach the rows of every process from the losses of all of them.
+
+    Args:
+        rows: of this process.
+        equal: each process has as many rows; then nothing but the rows is exchanged.
+    """
+    own = torch.arange(len(rows), device=rows.device)
+    if not several_processes():
+        return rows, own
+    rank = distributed.get_rank()
+    before = rank * len(rows) if equal else (gather_rows(torch.full_like(own, rank)) < rank).sum()
+    places = own + before
+    gathered: Tensor = _RowsOfAll.apply(rows, places, equal)
+    return gathered, places
+
+
+class _RowsOfAll(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, places: Tensor, equal: bool) -> Tensor:
+        ctx.save_for_backward(places)
+        rows = rows.contiguous()
+        if not equal:
+            return gather_rows(rows)
+        parts = [torch.empty_like(rows) for _ in range(process_count())]
+        distributed.all_gather(parts, rows)
+        return torch.cat(parts)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        (places,) = ctx.saved_tensors
+        return sum_over_processes(gradients[0].clone(memory_format=torch.contiguous_format))[places], None, None

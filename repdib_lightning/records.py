@@ -46,12 +46,17 @@ class ActionSpec:
 
 @dataclass(frozen=True)
 class DataSpec:
-    """What a model must know of its data: every width in the package is derived from here."""
+    """What a model must know of its data: every width in the package is derived from here.
+
+    ``next_frame`` says that the first future of every sample is the frame after the anchor (``offsets[:, 1] == 1``),
+    in front of those that are drawn.
+    """
 
     observations: dict[str, ArraySpec]
     actions: ActionSpec | None = None
     frame_stack: int = 1
     horizon: int = 1
+    next_frame: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionaries, lists, strings and numbers only (JSON)."""
@@ -62,13 +67,16 @@ class DataSpec:
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> DataSpec:
-        """Inverse of :meth:`to_dict`. Raises KeyError or TypeError on missing or unknown fields."""
+        """Inverse of :meth:`to_dict`. Raises KeyError or TypeError on missing or unknown fields.
+
+        Bundles written before there was a ``next_frame`` lack it.
+        """
         observations = {
             name: ArraySpec(shape=tuple(spec["shape"]), dtype=spec["dtype"])
             for name, spec in plain["observations"].items()
         }
         actions = None if plain["actions"] is None else ActionSpec(**plain["actions"])
-        return cls(observations, actions, plain["frame_stack"], plain["horizon"])
+        return cls(observations, actions, plain["frame_stack"], plain["horizon"], plain.get("next_frame", False))
 
 
 @dataclass
@@ -78,7 +86,8 @@ class Batch:
     Attributes:
         observations: name -> (B, F, *shape); ``[:, 0]`` is the anchor o_t, ``[:, i]`` is o_{t+k_i}.
         actions: (B,) int64 or (B, A) float32, the action taken at the anchor; None in stores without actions.
-        offsets: (B, F) int64, time offsets k in steps; ``offsets[:, 0] == 0``.
+        offsets: (B, F) int64, time offsets k in steps; ``offsets[:, 0] == 0``, and ``offsets[:, 1] == 1`` where the
+            spec has ``next_frame``.
         rows: (B,) int64, the anchor's row in the store.
     """
 

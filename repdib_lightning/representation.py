@@ -31,8 +31,8 @@ class RepresentationModule(pl.LightningModule):
         objective: builds the objective from M and the spec.
         optimizer: builds the optimiser from the parameters.
         scheduler: builds a learning-rate scheduler from the optimiser, advanced at every step; none by default.
-        loss_weights: weight of each named loss term; unnamed ones keep their default (kl 0.01, commitment 0.25,
-            all others 1).
+        loss_weights: weight of each named loss term; unnamed ones keep their default
+            (``bottlenecks.base.DEFAULT_LOSS_WEIGHTS``: kl 0.01, commitment 0.25, ...; 1 where none is listed).
         warmup: term -> steps over which its weight rises linearly from 0.
         shift: random shift of the pictures while training, in pixels (DrQ-v2: 4 at 84 px); 0 turns it off.
     """

@@ -6,11 +6,12 @@
 from repdib_lightning.bottlenecks.base import Bottleneck
 from repdib_lightning.bottlenecks.identity import Identity
 from repdib_lightning.bottlenecks.repdib import RepDIB
+from repdib_lightning.bottlenecks.svib import SVIB
 from repdib_lightning.bottlenecks.variational import Variational
 from repdib_lightning.bottlenecks.vector_quantiser import VectorQuantiser
 
 BOTTLENECKS: dict[str, type[Bottleneck]] = {
-    kind.__name__: kind for kind in (Identity, Variational, VectorQuantiser, RepDIB)
+    kind.__name__: kind for kind in (Identity, Variational, VectorQuantiser, RepDIB, SVIB)
 }
 
-__all__ = ["BOTTLENECKS", "Bottleneck", "Identity", "RepDIB", "Variational", "VectorQuantiser"]
+__all__ = ["BOTTLENECKS", "SVIB", "Bottleneck", "Identity", "RepDIB", "Variational", "VectorQuantiser"]

@@ -8,8 +8,25 @@ from repdib_lightning.arguments import RememberedArguments
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import BottleneckOutput
 
-DEFAULT_LOSS_WEIGHTS = {"kl": 0.01, "commitment": 0.25}
-"""Paper: VIB coefficient 0.01 (all three tables); VQ-VAE: commitment 0.25. Every other term weighs 1."""
+DEFAULT_LOSS_WEIGHTS = {
+    "kl": 0.01,
+    "commitment": 0.25,
+    "information": 0.01,
+    "forward": 0.1,
+    "emi_error": 100.0,
+    "emi_information": 0.1,
+    "emi_action_kl": 0.5,
+    "db_kl": 0.1,
+    "db_prediction": 0.1,
+    "db_contrast": 0.1,
+}
+"""Weight of each named loss term; every other term weighs 1.
+
+``kl``: VIB coefficient of the paper, in all three tables. ``commitment``: VQ-VAE. ``information`` (SVIB): published
+nowhere, that of the VIB. ``forward``: ours, an auxiliary that must not outweigh its objective. ``emi_*``: the published
+program's for pixels (Atari); for states it has 1e4, 0.05 and 0.1. ``db_*``: the published program's, which by game sets
+0.001 to 0.1 for ``db_kl`` and 0.01 or 0.1 for ``db_contrast``.
+"""
 
 
 class Bottleneck(RememberedArguments):

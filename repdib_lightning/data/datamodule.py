@@ -21,7 +21,8 @@ class EpisodeDataModule(pl.LightningDataModule):
 
     Args:
         path: the store, an HDF5 file made by ``collect`` or ``import``.
-        batch_size: anchors B of a step, over all processes; a step encodes B * (1 + futures) frames.
+        batch_size: anchors B of a step, over all processes; a step encodes B * (1 + futures) frames, B more
+            with ``next_frame``.
         horizon: K, the largest time offset between an anchor and its futures, in steps. 1 gives one-step pairs.
         futures: futures drawn for each anchor.
         frame_stack: S, frames stacked into one observation.
@@ -31,6 +32,8 @@ class EpisodeDataModule(pl.LightningDataModule):
         resident: keep the arrays that are used on the training device, as they are stored (a picture stays uint8), and
             gather the same batches there: fastest where the data fit its memory. They are loaded once, by the first
             batch; each process of a training keeps its own copy. Needs workers = 0. Off: read through memory maps.
+        next_frame: put the frame after the anchor, t + 1, before the futures of every sample, whatever the horizon.
+            What is drawn stays as it is. Objectives that predict the next latent need it; the others leave it aside.
     """
 
     def __init__(
@@ -44,12 +47,13 @@ class EpisodeDataModule(pl.LightningDataModule):
         workers: int = 0,
         seed: int = 0,
         resident: bool = False,
+        next_frame: bool = False,
     ) -> None:
         super().__init__()
         self.path = Path(path)
         self.batch_size, self.horizon, self.futures = batch_size, horizon, futures
         self.frame_stack, self.views, self.workers, self.seed = frame_stack, views, workers, seed
-        self.resident = resident
+        self.resident, self.next_frame = resident, next_frame
         for name in ("batch_size", "horizon", "futures", "frame_stack"):
             if getattr(self, name) < 1:
                 raise UserError(f"data.{name} must be at least 1, is {getattr(self, name)}")
@@ -79,7 +83,14 @@ class EpisodeDataModule(pl.LightningDataModule):
 
     def _sampling(self, split: Split) -> FutureSampling:
         assert self.store is not None
-        return FutureSampling(self.store, split, horizon=self.horizon, futures=self.futures, seed=self.seed)
+        return FutureSampling(
+            self.store,
+            split,
+            horizon=self.horizon,
+            futures=self.futures,
+            seed=self.seed,
+            next_frame=self.next_frame,
+        )
 
     @property
     def spec(self) -> DataSpec:
@@ -90,7 +101,7 @@ class EpisodeDataModule(pl.LightningDataModule):
             array = self.store.observations[name]
             shape = (array.shape[0] * self.frame_stack, *array.shape[1:])
             observations[name] = ArraySpec(shape, array.dtype)
-        return DataSpec(observations, self.store.actions_spec, self.frame_stack, self.horizon)
+        return DataSpec(observations, self.store.actions_spec, self.frame_stack, self.horizon, self.next_frame)
 
     def example(self) -> Batch:
         """The first two held-out samples. Only after :meth:`setup`."""

@@ -18,7 +18,8 @@ class MazeDataModule(EpisodeDataModule):
         samples: actions to record where the file has to be collected (paper: 10,000).
         distractors: what plays behind the maze; see :mod:`repdib_lightning.environments.distractors`. None: nothing.
         collection_seed: of that recording.
-        batch_size, horizon, futures, frame_stack, views, workers, seed, resident: see :class:`EpisodeDataModule`.
+        batch_size, horizon, futures, frame_stack, views, workers, seed, resident, next_frame: see
+            :class:`EpisodeDataModule`.
     """
 
     def __init__(
@@ -36,8 +37,9 @@ class MazeDataModule(EpisodeDataModule):
         workers: int = 0,
         seed: int = 0,
         resident: bool = False,
+        next_frame: bool = False,
     ) -> None:
-        super().__init__(path, batch_size, horizon, futures, frame_stack, views, workers, seed, resident)
+        super().__init__(path, batch_size, horizon, futures, frame_stack, views, workers, seed, resident, next_frame)
         self.world, self.distractors = world, distractors
         self.samples, self.collection_seed = samples, collection_seed
 

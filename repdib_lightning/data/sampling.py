@@ -47,12 +47,23 @@ class FutureSampling:
         horizon: K.
         futures: n, so a sample has F = 1 + n frames.
         seed: of the stream.
+        next_frame: a sample has F = 2 + n frames, of which the second is t + 1, whatever K. The order and the n futures
+            drawn are those without it.
 
     Raises:
         UserError: an episode is not longer than the horizon, or the split is empty.
     """
 
-    def __init__(self, store: EpisodeStore, split: Split, *, horizon: int, futures: int, seed: int) -> None:
+    def __init__(
+        self,
+        store: EpisodeStore,
+        split: Split,
+        *,
+        horizon: int,
+        futures: int,
+        seed: int,
+        next_frame: bool = False,
+    ) -> None:
         if horizon < 1 or futures < 1:
             raise UserError(f"horizon ({horizon}) and futures ({futures}) must be at least 1")
         episodes = store.episodes(split)
@@ -63,7 +74,7 @@ class FutureSampling:
             raise UserError(_too_short(store, episodes, int(short[0]), horizon))
         spans = [np.arange(store.starts[e], store.starts[e] + store.lengths[e] - horizon) for e in episodes]
         self.anchors = np.concatenate(spans)
-        self.horizon, self.futures, self.seed = horizon, futures, seed
+        self.horizon, self.futures, self.seed, self.next_frame = horizon, futures, seed, next_frame
         self._epoch = -1
 
     def __len__(self) -> int:
@@ -77,16 +88,18 @@ class FutureSampling:
             numbers: (n,) int64, epoch * len(self) + position.
 
         Returns:
-            anchor rows (n,) int64, and offsets (n, F) int64 with a leading 0.
+            anchor rows (n,) int64, and offsets (n, F) int64 with a leading 0, or 0 and 1 with ``next_frame``.
         """
         epochs, positions = np.divmod(numbers, len(self))
         rows = np.empty(len(numbers), np.int64)
-        offsets = np.zeros((len(numbers), 1 + self.futures), np.int64)
+        fixed = [0, 1] if self.next_frame else [0]
+        offsets = np.empty((len(numbers), len(fixed) + self.futures), np.int64)
+        offsets[:, : len(fixed)] = fixed
         for epoch in np.unique(epochs):
             self._prepare(int(epoch))
             here = epochs == epoch
             rows[here] = self._order[positions[here]]
-            offsets[here, 1:] = self._offsets[positions[here]]
+            offsets[here, len(fixed) :] = self._offsets[positions[here]]
         return rows, offsets
 
     def _prepare(self, epoch: int) -> None:

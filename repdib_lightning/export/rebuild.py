@@ -165,8 +165,15 @@ def _spec(path: Path, plain: Mapping[str, Any]) -> DataSpec:
             raise UserError(
                 f"{path}: 'spec.actions' must hold kind (discrete or continuous) and size, is {actions!r:.60}"
             )
+    next_frame = plain.get("next_frame", False)  # bundles written before there was one lack it
+    if not isinstance(next_frame, bool):
+        raise UserError(f"{path}: 'spec.next_frame' must be true or false, is {next_frame!r:.60}")
     return DataSpec(
-        observations, None if actions is None else ActionSpec(**actions), plain["frame_stack"], plain["horizon"]
+        observations,
+        None if actions is None else ActionSpec(**actions),
+        plain["frame_stack"],
+        plain["horizon"],
+        next_frame,
     )
 
 

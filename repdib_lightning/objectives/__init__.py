@@ -2,10 +2,28 @@
 
 from repdib_lightning.objectives.base import Encode, Objective
 from repdib_lightning.objectives.driml import DRIML
+from repdib_lightning.objectives.dynamic_bottleneck import DynamicBottleneck
+from repdib_lightning.objectives.emi import EMI
+from repdib_lightning.objectives.forward_prediction import ForwardPrediction
 from repdib_lightning.objectives.info_nce import InfoNCE
 from repdib_lightning.objectives.inverse_dynamics import InverseDynamics
+from repdib_lightning.objectives.several import SeveralObjectives
 
-OBJECTIVES: dict[str, type[Objective]] = {cls.__name__: cls for cls in (InverseDynamics, DRIML, InfoNCE)}
+OBJECTIVES: dict[str, type[Objective]] = {
+    cls.__name__: cls
+    for cls in (InverseDynamics, DRIML, InfoNCE, ForwardPrediction, EMI, DynamicBottleneck, SeveralObjectives)
+}
 """The objectives by name."""
 
-__all__ = ["DRIML", "OBJECTIVES", "Encode", "InfoNCE", "InverseDynamics", "Objective"]
+__all__ = [
+    "DRIML",
+    "EMI",
+    "OBJECTIVES",
+    "DynamicBottleneck",
+    "Encode",
+    "ForwardPrediction",
+    "InfoNCE",
+    "InverseDynamics",
+    "Objective",
+    "SeveralObjectives",
+]

@@ -48,7 +48,7 @@ class DRIML(TemporalContrast):
         clip: float = 20.0,
         feed_action: bool = True,
     ) -> None:
-        super().__init__()
+        super().__init__(spec)
         for name, value in (("hidden", hidden), ("action_features", action_features)):
             if value < 1:
                 raise UserError(f"DRIML: {name} must be at least 1, is {value}")

@@ -26,7 +26,7 @@ class InfoNCE(TemporalContrast):
 
     Args:
         width: M, also that of the hidden layers.
-        spec: unused; any data will do.
+        spec: which frames of a sample are drawn futures; any data will do.
         projection: width in which pairs are compared.
         temperature: divides the cosine; small ones weigh the hardest candidates more.
 
@@ -35,7 +35,7 @@ class InfoNCE(TemporalContrast):
     """
 
     def __init__(self, width: int, spec: DataSpec, *, projection: int = 128, temperature: float = 0.1) -> None:
-        super().__init__()
+        super().__init__(spec)
         if projection < 1:
             raise UserError(f"InfoNCE: projection must be at least 1, is {projection}")
         if not (temperature > 0 and math.isfinite(temperature)):

