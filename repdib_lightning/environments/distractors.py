@@ -91,7 +91,7 @@ class Distractors:
         """
         height, width = (size, size) if isinstance(size, int) else size
         if split not in _SPLITS:
-            raise UserError(f"distractors: unknown split '{split}' {nearest(split, _SPLITS)}")
+            raise UserError(f"distractors: unknown split '{split}', {nearest(split, _SPLITS)}")
         if frames < 1 or height < 1 or width < 1 or (limit is not None and limit < 1):
             raise UserError(f"distractors: size {size}, frames {frames} and limit {limit} must be at least 1")
         return cls(_open_source(source, seed, frames), split, height, width, limit, seed)
@@ -123,7 +123,7 @@ def _open_source(source: str, seed: int, frames: int) -> _Source:
     folder = Path(source).expanduser()
     if not folder.is_dir():
         known = [*BUILT_IN, "a folder of pictures or videos", "a folder with " + CIFAR_FOLDER]
-        raise UserError(f"distractors: '{source}' is neither built in nor a folder {nearest(source, known)}")
+        raise UserError(f"distractors: '{source}' is neither built in nor a folder, {nearest(source, known)}")
     for root in (folder, folder.parent):
         if (root / CIFAR_FOLDER).is_dir() and (root == folder or folder.name == CIFAR_FOLDER):
             return Cifar10(root)

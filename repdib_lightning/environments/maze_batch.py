@@ -128,7 +128,7 @@ class MazeBatch:
         found = {}
         for name, value in (options or {}).items():
             if name not in known:
-                raise UserError(f"reset: unknown option '{name}' {nearest(name, known)}")
+                raise UserError(f"reset: unknown option '{name}', {nearest(name, known)}")
             cells = [value] if _is_one_cell(value) else list(value)
             if len(cells) not in (1, len(self.cells)):
                 raise UserError(f"{name}: names {len(cells)} cells for {len(self.cells)} mazes; give one, or one each")

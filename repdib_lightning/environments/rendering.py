@@ -67,7 +67,7 @@ def _backend() -> str:
     backend = os.environ.setdefault("MUJOCO_GL", DEFAULT_BACKEND).lower().strip() or DEFAULT_BACKEND
     os.environ["MUJOCO_GL"] = backend
     if backend not in BACKENDS:
-        raise UserError(f"MUJOCO_GL={backend}: not a headless renderer {nearest(backend, BACKENDS)}")
+        raise UserError(f"MUJOCO_GL={backend}: not a headless renderer, {nearest(backend, BACKENDS)}")
     return backend
 
 

@@ -172,6 +172,14 @@ def picture(content: bytes, description: str) -> str:
     return f'<p><img alt="{html.escape(description, quote=True)}" src="data:image/png;base64,{data}"></p>'
 
 
+def film(content: bytes, description: str) -> str:
+    """An inline MP4 that plays without sound, over and over."""
+    data = base64.b64encode(content).decode()
+    label = html.escape(description, quote=True)
+    source = f"data:video/mp4;base64,{data}"
+    return f'<p>{label}<br><video aria-label="{label}" src="{source}" controls loop muted playsinline></video></p>'
+
+
 def comparison_sections(runs: Mapping[str, RunResult], store: EpisodeStore) -> list[Section]:
     """The sections of the page, in reading order; what has nothing to show is left out."""
     reports = {name: run.report for name, run in runs.items()}

@@ -80,10 +80,11 @@ def _with_outcome(facts: Facts, name: str, path: Path) -> Facts:
         for measure, value in outcome["measures"].items():
             _add(metrics, f"{outcome['agent']}/{name}/{measure}", value)
         used = {**facts.configuration.get("finetune", {}), name: outcome["configuration"]}
-        versions = facts.versions or outcome["versions"]
+        versions, data = facts.versions or outcome["versions"], facts.data or outcome.get("data", {})
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path}: not the outcome of a fine-tuning ({type(error).__name__}: {error})") from error
-    return replace(facts, configuration={**facts.configuration, "finetune": used}, versions=versions, metrics=metrics)
+    configuration = {**facts.configuration, "finetune": used}
+    return replace(facts, configuration=configuration, versions=versions, data=data, metrics=metrics)
 
 
 def _trained(run: Path) -> dict[str, float]:

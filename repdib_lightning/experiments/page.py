@@ -5,9 +5,9 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from repdib_lightning.evaluation.report import Section, picture
+from repdib_lightning.evaluation.report import Section, film, picture
 from repdib_lightning.evaluation.tables import Table
 from repdib_lightning.experiments.results import Results
 from repdib_lightning.experiments.tables import markdown
@@ -17,12 +17,13 @@ WIDE = 6
 
 @dataclass(frozen=True)
 class Part:
-    """One part of the report: a heading with sentences, tables and figures (file name -> PNG)."""
+    """One part of the report: a heading with sentences, tables, figures (file name -> PNG) and films (-> MP4)."""
 
     title: str
     sentences: list[str]
     tables: list[Table]
     figures: dict[str, bytes]
+    films: dict[str, bytes] = field(default_factory=dict)
 
 
 def facts_of(results: Results) -> list[str]:
@@ -63,6 +64,7 @@ def as_markdown(title: str, facts: Sequence[str], parts: Sequence[Part]) -> str:
     for part in parts:
         blocks += [f"## {part.title}", *part.sentences, *[markdown(table) for table in part.tables]]
         blocks += [f"![{name}]({name}.png)" for name in part.figures]
+        blocks += [f"[{name}]({name}.mp4)" for name in part.films]
     return "\n\n".join(blocks) + "\n"
 
 
@@ -71,6 +73,7 @@ def as_section(part: Part) -> Section:
     body = [f"<p>{html.escape(sentence)}</p>" for sentence in part.sentences]
     body += [f'<div class="{_width(table)}">{table.html()}</div>' for table in part.tables]
     body += [picture(content, name) for name, content in part.figures.items()]
+    body += [film(content, name) for name, content in part.films.items()]
     return Section(part.title, "\n".join(body))
 
 

@@ -215,7 +215,7 @@ class Point:
 
 
 def points_of(suite: Suite, seeds: Iterable[int], root: Path, only: Iterable[str] = ()) -> list[Point]:
-    """Every point of a suite once, all settings of a seed before the next seed.
+    """Every point of a suite once, all settings of a seed before the next seed; a grid may have fewer of the seeds.
 
     Args:
         suite: the suite. seeds: to use. root: folder of all suites' runs.
@@ -224,7 +224,8 @@ def points_of(suite: Suite, seeds: Iterable[int], root: Path, only: Iterable[str
     wanted = set(only)
     chosen = [setting for setting in suite.settings if not wanted or setting.place in wanted]
     place = root / suite.name
-    return [Point(suite, setting, seed, place / setting.place / f"seed_{seed}") for seed in seeds for setting in chosen]
+    pairs = [(setting, seed) for seed in seeds for setting in chosen if suite.has(setting, seed)]
+    return [Point(suite, setting, seed, place / setting.place / f"seed_{seed}") for setting, seed in pairs]
 
 
 def _take(file: IO[str]) -> bool:

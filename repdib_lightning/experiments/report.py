@@ -17,6 +17,7 @@ from repdib_lightning.experiments import figures, tables
 from repdib_lightning.experiments.comparison import Difference, Summary, differences, summaries
 from repdib_lightning.experiments.curve_names import check_curves
 from repdib_lightning.experiments.curves import Band, bands, finetune_bands, write_bands
+from repdib_lightning.experiments.film_part import film_parts
 from repdib_lightning.experiments.finetune_parts import finetune_parts, training_only
 from repdib_lightning.experiments.headline import headline, verdicts
 from repdib_lightning.experiments.maze_maps import Maps, mean_maps, write_maps
@@ -58,6 +59,7 @@ def report_suite(
     all_maps = {grid.name: mean_maps(results, grid) for grid in plan.grids}
     found = {grid.name: (summaries(results, grid), differences(results, grid)) for grid in plan.grids}
     parts = [*_headline_part(results), *_grid_parts(results, found, all_bands, all_maps), *_latent_parts(results)]
+    parts += film_parts(results)
     _write(folder, results, parts, all_bands)
     if any(all_maps.values()):
         write_maps(folder / "maps.json", all_maps)
@@ -188,6 +190,9 @@ def _write(
     for part in parts:
         for name, content in part.figures.items():
             with whole_file(folder / f"{name}.png") as aside:
+                aside.write_bytes(content)
+        for name, content in part.films.items():
+            with whole_file(folder / f"{name}.mp4") as aside:
                 aside.write_bytes(content)
     facts = facts_of(results)
     _write_text(folder / "report.md", as_markdown(suite.title, facts, parts))

@@ -106,6 +106,7 @@ class Grid:
         settings: in the order of the file; ``baseline`` is the name of the one that the others are compared with.
         data: the store that its settings are trained and probed on.
         collect: words of a ``collect`` command that makes the store where it is absent; empty for none.
+        seeds: of the suite's reported seeds, those that its settings are run with; empty for all.
     """
 
     name: str
@@ -114,6 +115,7 @@ class Grid:
     settings: tuple[Setting, ...]
     data: Path
     collect: tuple[str, ...]
+    seeds: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -172,6 +174,7 @@ class Suite:
         curves: columns of metrics.csv to draw. finetune_curves: columns of the fine-tunings' progress.csv to draw.
         show: settings of the first grid whose latents and drawn pictures are shown. colours: factors that colour them.
         maps: settings whose maps of mazes are shown; empty for all.
+        films: places (``grid/setting``) of the settings whose policies are shown in films.
     """
 
     name: str
@@ -193,6 +196,7 @@ class Suite:
     colours: tuple[str, ...] = ()
     finetune_curves: tuple[str, ...] = ("eval/success",)
     maps: tuple[str, ...] = ()
+    films: tuple[str, ...] = ()
 
     def grid(self, name: str) -> Grid:
         """The grid of this name; the first one for an empty name."""
@@ -209,6 +213,14 @@ class Suite:
         for setting in itertools.chain.from_iterable(grid.settings for grid in self.grids):
             kept.setdefault(identity(setting), setting)
         return kept
+
+    def has(self, setting: Setting, seed: int) -> bool:
+        """Whether a setting is run with a seed: one that a grid of it has, or one that the suite does not name."""
+        if seed not in self.seeds:
+            return True
+        same = identity(setting)
+        grids = [grid for grid in self.grids if any(identity(other) == same for other in grid.settings)]
+        return any(not grid.seeds or seed in grid.seeds for grid in grids)
 
     def run_by(self, setting: Setting) -> Setting:
         """The setting whose runs this one shares (mostly itself)."""

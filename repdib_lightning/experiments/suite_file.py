@@ -10,7 +10,7 @@ import yaml
 
 from repdib_lightning import configurations
 from repdib_lightning.errors import UserError, nearest
-from repdib_lightning.experiments.suite import PROBE_OPTIONS, Claim, Grid, HeadlineRow, Suite, check_seeds
+from repdib_lightning.experiments.suite import PROBE_OPTIONS, Claim, Grid, HeadlineRow, Suite
 from repdib_lightning.experiments.suite_checks import check_choice, check_keys, check_number, listed, mapping, words
 from repdib_lightning.experiments.suite_grids import (
     Common,
@@ -18,6 +18,7 @@ from repdib_lightning.experiments.suite_grids import (
     read_config,
     read_finetune,
     read_grid,
+    read_seeds,
     read_store,
 )
 from repdib_lightning.experiments.suite_measures import check_measures
@@ -66,8 +67,8 @@ def read_suite(name: str | Path) -> Suite:
         file=file,
         data=read_store(file, "data", tree["data"]),
         collect=read_collect(file, "collect", tree.get("collect")),
-        seeds=_seeds(file, "seeds", tree.get("seeds", [0, 1, 2, 3, 4])),
-        tune_seeds=_seeds(file, "tune_seeds", tree.get("tune_seeds", [100, 101, 102])),
+        seeds=read_seeds(file, "seeds", tree.get("seeds", [0, 1, 2, 3, 4])),
+        tune_seeds=read_seeds(file, "tune_seeds", tree.get("tune_seeds", [100, 101, 102])),
         threads=threads,
         probe=check_keys(file, "probe", tree.get("probe") or {}, set(PROBE_OPTIONS)),
         slurm=mapping(file, "slurm", tree.get("slurm")),
@@ -79,6 +80,7 @@ def read_suite(name: str | Path) -> Suite:
         show=_show(file, words(file, "show", tree.get("show", []), known), built[0]),
         colours=words(file, "colours", tree.get("colours", [])),
         finetune_curves=words(file, "finetune_curves", tree.get("finetune_curves", ["eval/success"])),
+        films=words(file, "films", tree.get("films", []), [s.place for grid in built for s in grid.settings]),
         maps=words(file, "maps", tree.get("maps", []), [s.name for grid in built for s in grid.settings]),
     )
     check_measures(suite)
@@ -158,12 +160,3 @@ def _claim(file: Path, text: str, content: Any, grids: Sequence[Grid]) -> Claim:
     for bound in bounds:
         check_number(file, key, bound)
     return Claim(text, **content)
-
-
-def _seeds(file: Path, key: str, given: Any) -> tuple[int, ...]:
-    if not isinstance(given, list) or not given or not all(type(seed) is int and seed >= 0 for seed in given):
-        raise UserError(f"{file}: {key} must be a list of seeds such as [0, 1, 2], is {given!r:.60}")
-    if len(set(given)) < len(given):
-        raise UserError(f"{file}: {key} names a seed twice: {given}")
-    check_seeds(given, tune=key == "tune_seeds", where=f"{file}: {key}")
-    return tuple(given)

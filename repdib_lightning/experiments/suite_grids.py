@@ -15,14 +15,14 @@ import yaml
 from repdib_lightning import configurations
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.experiments.merging import merged, with_option
-from repdib_lightning.experiments.suite import CONFIG, SET_BY_SUITE, Finetune, Grid, Setting
+from repdib_lightning.experiments.suite import CONFIG, SET_BY_SUITE, Finetune, Grid, Setting, check_seeds
 from repdib_lightning.experiments.suite_checks import check_choice, check_keys, check_name, listed, mapping
 from repdib_lightning.rl import AGENTS
 
 PRETRAINED = "pretrained"
 """Key of a setting: false for one without pre-training."""
 
-SET_FOR_FINETUNE = ("seed", "encoder", "run", "overwrite")
+SET_FOR_FINETUNE = ("seed", "encoder", "run", "overwrite", "data")
 """Options of ``finetune`` that follow from the point."""
 
 
@@ -44,10 +44,13 @@ def read_grid(file: Path, name: str, content: Any, common: Common) -> Grid:
     """One grid. Raises UserError naming the file and the key."""
     key = f"grids.{name}"
     check_name(file, key, name)
-    known = {"about", "baseline", "with", "vary", "settings", "data", "collect", "finetune"}
+    known = {"about", "baseline", "with", "vary", "settings", "data", "collect", "finetune", "seeds"}
     check_keys(file, key, content, known)
     own = _own(file, key, content, common)
     finetune = read_finetune(file, f"{key}.finetune" if content.get("finetune") else "finetune", own.finetune)
+    if finetune is not None and learns_from_data(finetune.agent):
+        told = {run: {"data": str(own.data), **options} for run, options in finetune.runs.items()}
+        finetune = replace(finetune, runs=told)
     fixed = mapping(file, f"{key}.with", content.get("with"))
     _check_options(file, f"{key}.with", fixed)
     if PRETRAINED in fixed:
@@ -66,7 +69,8 @@ def read_grid(file: Path, name: str, content: Any, common: Common) -> Grid:
     baseline = str(content.get("baseline", names[0]))
     if baseline not in names:
         raise UserError(f"{file}: {key}.baseline: no setting is called '{baseline}', {nearest(baseline, names)}")
-    return Grid(name, str(content.get("about", "")), baseline, tuple(settings), own.data, own.collect)
+    seeds = read_seeds(file, f"{key}.seeds", content["seeds"]) if "seeds" in content else ()
+    return Grid(name, str(content.get("about", "")), baseline, tuple(settings), own.data, own.collect, seeds)
 
 
 def read_store(file: Path, key: str, given: Any) -> Path:
@@ -81,6 +85,16 @@ def read_collect(file: Path, key: str, given: Any) -> tuple[str, ...]:
     if given is not None and not isinstance(given, str):
         raise UserError(f"{file}: {key} must be words of a collect command, such as robot_arm, is {given!r:.60}")
     return tuple((given or "").split())
+
+
+def read_seeds(file: Path, key: str, given: Any) -> tuple[int, ...]:
+    """Seeds as a file lists them: of development under ``tune_seeds``, else reported ones."""
+    if not isinstance(given, list) or not given or not all(type(seed) is int and seed >= 0 for seed in given):
+        raise UserError(f"{file}: {key} must be a list of seeds such as [0, 1, 2], is {given!r:.60}")
+    if len(set(given)) < len(given):
+        raise UserError(f"{file}: {key} names a seed twice: {given}")
+    check_seeds(given, tune=key == "tune_seeds", where=f"{file}: {key}")
+    return tuple(given)
 
 
 def read_config(file: Path, key: str, name: Any) -> str:
@@ -113,9 +127,14 @@ def read_finetune(file: Path, key: str, content: Mapping[str, Any]) -> Finetune 
         options = mapping(file, f"{key}.runs.{name}", own)
         _check_finetune_options(file, f"{key}.runs.{name}", options, known)
         runs[name] = {**shared, **options}
-        if not isinstance(runs[name].get("env"), str):
+        if not learns_from_data(agent) and not isinstance(runs[name].get("env"), str):
             raise UserError(f"{file}: {key}.runs.{name}.env must name an environment, such as SpiralWorld")
     return Finetune(agent, runs)
+
+
+def learns_from_data(agent: str) -> bool:
+    """Whether an agent takes a store: the one of its setting's grid."""
+    return "data" in _parameters(agent)
 
 
 def _own(file: Path, key: str, content: Mapping[str, Any], common: Common) -> Common:
@@ -155,7 +174,8 @@ def _named(file: Path, key: str, content: Mapping[str, Any]) -> list[tuple[str, 
 def _setting(file: Path, key: str, bare: Setting, parts: Sequence[Mapping[str, Any]], own: Common) -> Setting:
     fixed, given = parts
     if not _is_pretrained(file, f"{key}.settings.{bare.name}", given, bare):
-        return replace(bare, pretrained=False)
+        needs_data = bare.finetune is not None and learns_from_data(bare.finetune.agent)
+        return replace(bare, pretrained=False, data=own.data if needs_data else None)
     given = {option: value for option, value in given.items() if option != PRETRAINED}
     configs = [*own.base, *(read_config(file, key, c) for part in (fixed, given) for c in listed(part.get(CONFIG, [])))]
     options = {k: v for part in (fixed, given) for k, v in part.items() if k != CONFIG}
@@ -212,9 +232,12 @@ def _check_options(file: Path, key: str, options: Mapping[Any, Any]) -> None:
 
 def _options_of(agent: str) -> list[str]:
     """Options of ``finetune AGENT`` that a suite may give."""
+    return [name for name in _parameters(agent) if name not in SET_FOR_FINETUNE]
+
+
+def _parameters(agent: str) -> list[str]:
     module, _, function = AGENTS[agent].partition(":")
-    names = inspect.signature(getattr(importlib.import_module(module), function)).parameters
-    return [name for name in names if name not in SET_FOR_FINETUNE]
+    return list(inspect.signature(getattr(importlib.import_module(module), function)).parameters)
 
 
 def _check_finetune_options(file: Path, key: str, options: Mapping[Any, Any], known: Sequence[str]) -> None:

@@ -259,7 +259,7 @@ def test_bad_arguments_are_named(arguments, said):
         ({"goal": 7}, "goal=7: expected row,column"),
         ({"goal": "none"}, "goal=none: expected row,column"),
         ({"start": ["0,0", "0,1"]}, "start: names 2 cells for 1 mazes"),
-        ({"strat": "0,0"}, "unknown option 'strat' did you mean 'start'"),
+        ({"strat": "0,0"}, "unknown option 'strat', did you mean 'start'"),
     ],
 )
 def test_bad_options_of_reset_are_named_and_change_nothing(options, said):

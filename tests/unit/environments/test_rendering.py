@@ -37,7 +37,7 @@ def run_python(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
 
 def test_importing_the_package_loads_no_simulator_and_sets_no_variable():
     done = run_python(
-        "import os, sys, repdib_lightning.environments, repdib_lightning.environments.collect\n"
+        "import os, sys, repdib_lightning.environments, repdib_lightning.environments.collect_robot_arm\n"
         "print([name for name in ('mujoco', 'dm_control', 'gymnasium', 'triton') if name in sys.modules])\n"
         "print('MUJOCO_GL' in os.environ)"
     )
