@@ -5,7 +5,7 @@ BIN := .venv/bin
 RUN := $(BIN)/python -m repdib_lightning
 DEMO := runs/demo
 
-.PHONY: install demo robot-arm mazes bench bench-gpu test lint clean
+.PHONY: install demo demo-control robot-arm mazes control bench bench-gpu test lint clean
 
 install: .venv/installed
 
@@ -27,6 +27,18 @@ demo: install
 	done
 	$(RUN) compare data/robot_arm_demo.h5 $(DEMO)/report.html $(DEMO)/none $(DEMO)/repdib
 
+# Pixels to a walking policy amid videos: data, two trainings, probes, TD3+BC on each frozen encoder, films.
+demo-control: install
+	rm -rf runs/demo_control
+	$(RUN) fit --config control --config bottleneck/none --config demo_control --run runs/demo_control/none
+	$(RUN) fit --config control --config demo_control --run runs/demo_control/repdib
+	for kind in none repdib; do $(RUN) export runs/demo_control/$$kind || exit 1; done
+	$(RUN) compare data/walker_walk_demo.h5 runs/demo_control/report.html runs/demo_control/none runs/demo_control/repdib
+	for kind in none repdib; do \
+		$(RUN) finetune td3bc --data data/walker_walk_demo.h5 --encoder runs/demo_control/$$kind \
+			--run runs/demo_control/$$kind/td3bc --hidden 256 --steps 3000 --evaluate_every 1500 || exit 1; \
+	done
+
 # The paper's robot-arm table, five seeds, full size: 35 runs, about 100 minutes on 2 cores; goes on where it stopped.
 robot-arm: install
 	$(RUN) suite run robot_arm
@@ -36,6 +48,11 @@ robot-arm: install
 mazes: install
 	$(RUN) suite run mazes
 	$(RUN) suite report mazes
+
+# The paper's offline visual control on walker-walk, three to five seeds; goes on where it stopped.
+control: install
+	$(RUN) suite run control
+	$(RUN) suite report control
 
 # Speed against peers and limits, about 20 minutes; writes results/benchmarks.md. Close other programs first.
 bench bench-gpu: install

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import lightning.pytorch as pl
@@ -34,6 +35,8 @@ class EpisodeDataModule(pl.LightningDataModule):
             batch; each process of a training keeps its own copy. Needs workers = 0. Off: read through memory maps.
         next_frame: put the frame after the anchor, t + 1, before the futures of every sample, whatever the horizon.
             What is drawn stays as it is. Objectives that predict the next latent need it; the others leave it aside.
+        collect: words of a ``collect`` command that makes the file where it is absent, without the path, such as
+            ``control --distractors video``.
     """
 
     def __init__(
@@ -48,12 +51,13 @@ class EpisodeDataModule(pl.LightningDataModule):
         seed: int = 0,
         resident: bool = False,
         next_frame: bool = False,
+        collect: str = "",
     ) -> None:
         super().__init__()
         self.path = Path(path)
         self.batch_size, self.horizon, self.futures = batch_size, horizon, futures
         self.frame_stack, self.views, self.workers, self.seed = frame_stack, views, workers, seed
-        self.resident, self.next_frame = resident, next_frame
+        self.resident, self.next_frame, self.collect = resident, next_frame, collect
         for name in ("batch_size", "horizon", "futures", "frame_stack"):
             if getattr(self, name) < 1:
                 raise UserError(f"data.{name} must be at least 1, is {getattr(self, name)}")
@@ -69,6 +73,15 @@ class EpisodeDataModule(pl.LightningDataModule):
         self.store: EpisodeStore | None = None
         self._kept: Resident | None = None
 
+    def prepare_data(self) -> None:
+        """Collect the file if it is absent and ``collect`` says how, and say so."""
+        if self.collect and not self.path.exists():
+            from repdib_lightning.verbs import collect
+
+            environment, *options = self.collect.split()
+            print(f"{self.path}: no such file; collecting {self.collect} there", file=sys.stderr, flush=True)
+            collect([environment, str(self.path), *options])
+
     def setup(self, stage: str | None = None) -> None:
         """Open and validate the store. Raises UserError, naming file and key, where something is wrong."""
         if self.store is not None:
@@ -76,7 +89,7 @@ class EpisodeDataModule(pl.LightningDataModule):
         store = EpisodeStore(self.path)
         for view in self.views or []:
             if view not in store.observations:
-                raise UserError(f"{self.path}: has no observation '{view}' {nearest(view, store.observations)}")
+                raise UserError(f"{self.path}: has no observation '{view}', {nearest(view, store.observations)}")
         self.store = store
         self._training = self._sampling("train")
         self._evaluation = self._sampling("evaluation")

@@ -46,7 +46,7 @@ class InverseDynamics(Objective):
             raise UserError("InverseDynamics: predicts actions, but the data has none ('actions' is missing)")
         if action_loss not in ("squared", "cosine"):
             raise UserError(
-                f"InverseDynamics: unknown action_loss '{action_loss}' {nearest(action_loss, ('squared', 'cosine'))}"
+                f"InverseDynamics: unknown action_loss '{action_loss}', {nearest(action_loss, ('squared', 'cosine'))}"
             )
         if hidden < 1:
             raise UserError(f"InverseDynamics: hidden must be at least 1, is {hidden}")

@@ -58,7 +58,7 @@ def fit(*options: str) -> list[str]:
         (fit("--model.bottleneck.init_args.groups", "7"), "groups 7 does not divide the width 128 (nearest: 4 or 8)"),
         (fit("--data.init_args.batch_size", "-3"), "data.batch_size must be at least 1, is -3"),
         (fit("--model.loss_weights", "{kll: 1.0}"), "no loss is called 'kll' in this run, did you mean 'kl'?"),
-        (fit("--data.init_args.views", "[frnt]"), "small.h5: has no observation 'frnt' did you mean 'front'?"),
+        (fit("--data.init_args.views", "[frnt]"), "small.h5: has no observation 'frnt', did you mean 'front'?"),
         (fit("--data.horizon", "30"), "episode 0 has 12 steps, fewer than the horizon 30"),
         (fit("--checkpoint_every", "0"), "checkpoint_every"),
         (fit("--data.batch_size", "1000"), "batch_size is 1000, the data has"),
