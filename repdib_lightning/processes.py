@@ -88,7 +88,7 @@ def gather_with_gradients(rows: Tensor, *, equal: bool) -> tuple[Tensor, Tensor]
         rows: of this process.
         equal: each process has as many rows; then nothing but the rows is exchanged.
     """
-    own = torch.arange(len(rows), device=rows.device)
+    own = torch.arange(rows.shape[0], device=rows.device)  # not len(), which a traced batch has none of
     if not several_processes():
         return rows, own
     rank = distributed.get_rank()

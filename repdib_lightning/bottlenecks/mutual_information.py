@@ -84,10 +84,9 @@ def mismatched(rows: Tensor, *, training: bool) -> Tensor:
         training: every process has as many rows then.
     """
     everywhere, places = gather_with_gradients(rows, equal=training)
-    count = len(everywhere)
+    count = everywhere.shape[0]
     if not training:
-        half = count // 2
-        return torch.cat([everywhere[half:], everywhere[:half]])[places]
+        return everywhere[(places + count // 2) % count]
     order = torch.randperm(count, device=rows.device)
     partners = torch.empty_like(order)
     partners[order] = order.roll(1)

@@ -15,9 +15,12 @@ from repdib_lightning.objectives.base import (
     require_several,
     require_transitions,
 )
-from repdib_lightning.objectives.spread import LEAST_SHARE, centre_and_spread
+from repdib_lightning.objectives.spread import centre_and_spread
 from repdib_lightning.processes import rows_of_all
 from repdib_lightning.records import Batch, DataSpec, ObjectiveOutput
+
+_LEAST_MOVE = 1e-4
+"""Of a batch in which nothing moves, as a share of the spread."""
 
 
 class ForwardPrediction(Objective):
@@ -83,5 +86,5 @@ class ForwardPrediction(Objective):
             error = (predicted.to(precise) - (after - centre) / scale).square().mean()
             moved = ((after - before) / scale).square().mean()
         return ObjectiveOutput(
-            {"forward": error}, {"forward_to_copying": error.detach() / moved.clamp_min(LEAST_SHARE)}
+            {"forward": error}, {"forward_to_copying": error.detach() / moved.clamp_min(_LEAST_MOVE)}
         )

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from repdib_lightning.processes import sum_over_processes
 
-LEAST_SHARE = 1e-4
+_LEAST_SHARE = 1e-8
 """The spread counts as at least this share of the mean square: equal rows differ by rounding."""
 
 
@@ -21,4 +21,4 @@ def centre_and_spread(rows: Tensor) -> tuple[Tensor, Tensor]:
     centre = sum_over_processes(rows.sum(0)) / count
     sums = torch.stack([(rows - centre).square().sum(), rows.square().sum()])
     spread, size = sum_over_processes(sums) / count
-    return centre, torch.maximum(spread, LEAST_SHARE * size).clamp_min(torch.finfo(rows.dtype).tiny)
+    return centre, torch.maximum(spread, _LEAST_SHARE * size).clamp_min(torch.finfo(rows.dtype).tiny)

@@ -17,8 +17,8 @@ from killing import command_in_processes
 
 from repdib_lightning.__main__ import VERBS, main
 from repdib_lightning.configurations import packaged, packaged_suites
-from repdib_lightning.environments.collect_robot_arm import collect_robot_arm
 from repdib_lightning.environments.collect_maze import collect_maze
+from repdib_lightning.environments.collect_robot_arm import collect_robot_arm
 from repdib_lightning.experiments.suite_file import read_suite
 
 ROOT = Path(__file__).parents[2]
@@ -57,7 +57,7 @@ BASES = ("robot_arm", "mazes")
 LAYERS = [
     *([base] for base in BASES),
     *(["robot_arm", name] for name in packaged() if name not in BASES),
-    *(["mazes", name] for name in packaged() if name.startswith("bottleneck/")),
+    *(["mazes", name] for name in packaged() if name.startswith(("bottleneck/", "objective/"))),
 ]
 
 
