@@ -1,0 +1,104 @@
+"""Suites of agents that learn from data, grids with fewer seeds, and films in the report."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+sys.path.insert(0, str(Path(__file__).parent))
+from finished_points import finish, typical
+
+from repdib_lightning.errors import UserError
+from repdib_lightning.experiments.film_part import frames_of
+from repdib_lightning.experiments.measures import collect_measures
+from repdib_lightning.experiments.points import points_of
+from repdib_lightning.experiments.report import report_suite
+from repdib_lightning.experiments.suite_file import read_suite
+from repdib_lightning.rl.film import side_by_side, write_film
+
+AGENT = {"agent": "td3bc", "with": {"steps": 200}, "runs": {"walk": None, "far": {"gamma": 0.9}}}
+HEAD = {"settings": {"none": {"config": "bottleneck/none"}, "scratch": {"pretrained": False}}}
+TAIL = {
+    "seeds": [0, 1],
+    "settings": {"none": {"config": "bottleneck/none"}, "vq": {"config": "bottleneck/vq"}},
+}
+
+
+def write(folder, **more) -> Path:
+    tree = {"base": "robot_arm", "data": "data/a.h5", "seeds": [0, 1, 2], "finetune": AGENT}
+    tree |= {"grids": {"head": HEAD, "tail": TAIL}, **more}
+    path = folder / "offline.yaml"
+    path.write_text(yaml.safe_dump(tree, sort_keys=False))
+    return path
+
+
+def test_an_agent_that_learns_from_data_is_given_its_grids_store_and_needs_no_environment(tmp_path):
+    other = {"data": "data/b.h5", "settings": {"none": {"config": "bottleneck/none"}}}
+    suite = read_suite(write(tmp_path, grids={"head": HEAD, "other": other}))
+    by_place = {setting.place: setting for setting in suite.settings}
+    assert by_place["head/none"].finetune.arguments("walk", 3) == [
+        *("td3bc", "--data", "data/a.h5", "--steps", "200", "--seed", "3")
+    ]
+    assert by_place["other/none"].finetune.runs["far"]["data"] == "data/b.h5"
+    scratch = by_place["head/scratch"]
+    assert scratch.data == Path("data/a.h5") and scratch.phases == ("finetune",)
+    with pytest.raises(UserError, match="'data' follows from the suite's seeds and runs"):
+        read_suite(write(tmp_path, finetune={**AGENT, "with": {"data": "data/c.h5"}}))
+
+
+def test_a_grid_may_have_fewer_seeds_and_a_setting_of_two_grids_has_those_of_both(tmp_path):
+    suite = read_suite(write(tmp_path))
+    seeds = {}
+    for point in points_of(suite, suite.seeds, tmp_path):
+        seeds.setdefault(point.setting.place, []).append(point.seed)
+    assert seeds == {"head/none": [0, 1, 2], "head/scratch": [0, 1, 2], "tail/vq": [0, 1]}
+    assert [p.seed for p in points_of(suite, [7], tmp_path, ["tail/vq"])] == [7], "asked for by name, it is run"
+    with pytest.raises(UserError, match=r"grids\.tail\.seeds must be a list of seeds"):
+        read_suite(write(tmp_path, grids={"tail": {**TAIL, "seeds": 3}}))
+    with pytest.raises(UserError, match="seed 100 is for development"):
+        read_suite(write(tmp_path, grids={"tail": {**TAIL, "seeds": [100]}}))
+
+
+def test_the_data_of_a_run_without_pretraining_are_those_of_its_agent(tmp_path):
+    outcome = {"agent": "td3bc", "versions": {}, "configuration": {}, "measures": {"return": 5.0}, "maps": {}}
+    path = tmp_path / "outcome.json"
+    path.write_text(json.dumps({**outcome, "data": {"file": "a.h5", "fingerprint": "abc"}}))
+    facts = collect_measures(tmp_path, None, {"walk": path})
+    assert facts.data["fingerprint"] == "abc" and facts.metrics == {"td3bc/walk/return": 5.0}
+
+
+def test_the_report_holds_the_films_of_the_settings_that_are_named(tmp_path):
+    path = write(tmp_path, films=["head/scratch", "tail/vq"])
+    suite, runs = read_suite(path), tmp_path / "runs"
+    for point in finish(suite, runs, lambda setting, seed: {**typical(setting, seed), "td3bc/walk/return": 1.0}):
+        for name in ("walk", "far"):
+            folder = point.finetune_folder(name)
+            folder.mkdir(parents=True)
+            (folder / "progress.csv").write_text("step,eval/return\n100,1\n200,2\n")
+            content = {"agent": "td3bc", "environment": "control", "measures": {}, "maps": {}}
+            (folder / "outcome.json").write_text(json.dumps(content))
+        shade = 40 * point.seed + 100
+        write_film(point.finetune_folder("walk") / "evaluation.mp4", np.full((9, 16, 16, 3), shade, np.uint8))
+    output = tmp_path / "out"
+    report_suite(path, output=output, runs=runs)
+    films = sorted(file.name for file in output.glob("*.mp4"))
+    assert films == ["film-head-scratch-walk.mp4", "film-tail-vq-walk.mp4"]
+    assert abs(int(frames_of(output / films[0], 3).mean()) - 100) < 5, "of the first seed"
+    page = (output / "report.html").read_text()
+    assert page.count("<video") == 2 and (output / "films.png").is_file()
+    assert "[film-tail-vq-walk](film-tail-vq-walk.mp4)" in (output / "report.md").read_text()
+    with pytest.raises(UserError, match="films.*'head/vq'"):
+        read_suite(write(tmp_path, films=["head/vq"]))
+
+
+def test_films_of_different_lengths_stand_side_by_side(tmp_path):
+    short, long = np.full((2, 4, 4, 3), 10, np.uint8), np.full((3, 4, 6, 3), 200, np.uint8)
+    both = side_by_side([short, long])
+    assert both.shape == (3, 4, 4 + 4 + 6, 3)
+    assert (both[2, :, :4] == 10).all() and (both[:, :, 4:8] == 255).all() and (both[:, :, 8:] == 200).all()
+    (tmp_path / "film.mp4").write_bytes(b"no film")
+    with pytest.raises(UserError, match=r"film\.mp4: not a readable film"):
+        frames_of(tmp_path / "film.mp4", 2)
