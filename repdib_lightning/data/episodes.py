@@ -98,6 +98,10 @@ class EpisodeStore:
         """N, final observations included."""
         return self._places[f"observations/{self._first}"][1][0]
 
+    def __contains__(self, name: str) -> bool:
+        """Whether there is an array of this key, such as ``rewards``."""
+        return name in self._places
+
     @property
     def fingerprint(self) -> str:
         """Hash of the content as written; empty for files that another program wrote."""

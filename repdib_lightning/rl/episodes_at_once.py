@@ -61,9 +61,11 @@ class EpisodesAtOnce:
 
     def _newest(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """(H, W, 3) uint8: the newest frame of all pictures, side by side; one of grey levels is shown in grey."""
+        pictures = {name: array.shape for name, array in self._spec.observations.items() if array.is_image}
+        height = max(shape[1] for shape in pictures.values())
         views = []
-        for name, array in self._spec.observations.items():
-            if array.is_image:
-                frame = observation[name][-(array.shape[0] // self._spec.frame_stack) :]
-                views.append(frame if len(frame) == 3 else np.repeat(frame[:1], 3, axis=0))
+        for name, shape in pictures.items():
+            frame = observation[name][-(shape[0] // self._spec.frame_stack) :]
+            coloured = frame if len(frame) == 3 else np.repeat(frame[:1], 3, axis=0)
+            views.append(np.pad(coloured, ((0, 0), (0, height - shape[1]), (0, 0))))
         return np.concatenate(views, axis=2).transpose(1, 2, 0)

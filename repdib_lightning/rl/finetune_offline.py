@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from repdib_lightning.errors import UserError
 from repdib_lightning.rl.offline_options import OfflineOptions, check_offline_options
 from repdib_lightning.rl.run_folders import check_folder, make_folder
 
@@ -76,7 +77,7 @@ def finetune_td3bc(
         frame_stack: of a trained encoder; 3 by default.
         evaluate_every: updates between evaluations.
         episodes: of an evaluation, played at once.
-        film: how many of them are filmed at the end.
+        film: how many of them are filmed at the end, at most.
         device: cpu, cuda, or auto.
         overwrite: replace an earlier run of this verb.
 
@@ -153,14 +154,20 @@ def _train(agent: str, given: Mapping[str, Any]) -> str:
     named = f"{agent}-{options.data.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder = given["run"] or Path("runs") / named
     check_folder(folder, given["overwrite"])
+    for name in ("data", "encoder"):
+        if given[name] is not None and folder.resolve() in (given[name].resolve(), *given[name].resolve().parents):
+            raise UserError(f"--run {folder}: holds --{name} {given[name]}; choose another folder")
     from repdib_lightning.quiet import quieten_lightning
     from repdib_lightning.rl.offline_training import OfflineTraining  # imports torch and Lightning
 
     quieten_lightning()
     training = OfflineTraining(options)
     make_folder(folder)
-    training.train(folder)
-    return f"{_told(training.finish(folder)['measures'], options)}    wrote {folder}"
+    try:
+        training.train(folder)
+        return f"{_told(training.finish(folder)['measures'], options)}    wrote {folder}"
+    finally:
+        training.close()
 
 
 def _told(measures: Mapping[str, float], options: OfflineOptions) -> str:

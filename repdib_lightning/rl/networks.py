@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from repdib_lightning.encoders.augmentation import random_shift
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.encoders.convolutional import initialise_orthogonally
+from repdib_lightning.rl.fast_linear import FastLinear
 
 
 class StandardisedLatents(nn.Module):
@@ -52,17 +53,20 @@ class ShiftedPictures(nn.Module):
 
 def perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     """Two hidden ReLU layers; orthogonal start, as in DrQ-v2."""
-    layers = [nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs)]
-    network = nn.Sequential(*layers)
+    layers: list[nn.Module] = []
+    for width in (inputs, hidden):
+        layers += [FastLinear(width, hidden), nn.ReLU(inplace=True)]
+    network = nn.Sequential(*layers, FastLinear(hidden, outputs))
     network.apply(initialise_orthogonally)
     return network
 
 
 class Actor(nn.Module):
-    """Features (B, M) to actions (B, A) in (-1, 1)."""
+    """Features (B, M) to actions (B, A) in (-1, 1). Attributes: ``features``, M."""
 
     def __init__(self, features: int, actions: int, hidden: int) -> None:
         super().__init__()
+        self.features = features
         self.network = perceptron(features, hidden, actions)
 
     def forward(self, features: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from repdib_lightning.rl.environment import open_environment
 from repdib_lightning.rl.offline_options import NO_ENVIRONMENT
 
 CONTROL = "repdib/Control-v0"
+_SHORT = "Control"
 _VD4RL = "dm_control/"
 
 _FIXED = ("task", "action_repeat", "image_size")
@@ -39,7 +40,7 @@ def evaluated_environment(
             raise UserError("--env_options mean nothing with --env none; leave one of them out")
         return None
     recorded = recorded_options(store)
-    if env and env != CONTROL:
+    if env and (env not in (CONTROL, _SHORT) or recorded is None):
         return env, dict(options)
     if recorded is None:
         raise UserError(
@@ -47,12 +48,17 @@ def evaluated_environment(
             "evaluation with --env none"
         )
     for name in _FIXED:
-        if name in options and name in recorded and options[name] != recorded[name]:
+        if name in options and _spelled(options[name]) != _spelled(recorded[name]):
             raise UserError(
                 f"--env_options.{name} {options[name]}: {store.path} was recorded with {recorded[name]}; leave it out, "
                 "or collect other data"
             )
-    return CONTROL, {**recorded, **options, "evaluation": options.get("evaluation", True)}
+    return CONTROL, {"evaluation": True, **recorded, **options}
+
+
+def _spelled(option: Any) -> Any:
+    """``walker_walk`` and ``walker-walk`` are the same task."""
+    return option.replace("_", "-") if isinstance(option, str) else option
 
 
 def recorded_options(store: EpisodeStore) -> dict[str, Any] | None:
@@ -75,10 +81,9 @@ def open_all(name: str, options: Mapping[str, Any], count: int, actions: int) ->
     Raises:
         UserError: no such environment, bad options, or other actions than the data's.
     """
-    opened: list[gymnasium.Env[Any, Any]] = []
-    for _ in range(count):
-        opened.append(open_environment(name, options))
-        space = opened[0].action_space
-        if not isinstance(space, gymnasium.spaces.Box) or space.shape != (actions,):
-            raise UserError(f"--env {name}: its actions are {space}, those of the data are continuous, {actions} wide")
-    return opened
+    opened = [open_environment(name, options)]
+    space = opened[0].action_space
+    if not isinstance(space, gymnasium.spaces.Box) or space.shape != (actions,):
+        opened[0].close()
+        raise UserError(f"--env {name}: its actions are {space}, those of the data are continuous, {actions} wide")
+    return opened + [open_environment(name, options) for _ in range(count - 1)]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from repdib_lightning.errors import UserError
+from repdib_lightning.rl.devices import check_device_name
 
 NO_ENVIRONMENT = "none"
 FRESH = {"features": 256, "channels": 32, "strides": [2, 1, 1, 1], "frame_stack": 3}
@@ -49,28 +51,37 @@ class OfflineOptions:
         return FRESH[name] if chosen is None else chosen
 
 
+_COUNTS = ("steps", "batch_size", "hidden", "copies", "evaluate_every", "episodes", "n_steps")
+
+
 def check_offline_options(options: OfflineOptions) -> None:
     """Raise UserError for a number out of range, or options that exclude each other."""
-    for name in ("steps", "batch_size", "hidden", "copies", "evaluate_every", "episodes", "n_steps"):
+    for name in _COUNTS:
         if getattr(options, name) < 1:
             raise UserError(f"--{name} must be at least 1, is {getattr(options, name)}")
     for name in ("seed", "shift", "film"):
         if not 0 <= getattr(options, name) < 2**32:
             raise UserError(f"--{name} must be from 0 to {2**32 - 1}, is {getattr(options, name)}")
-    if not options.learning_rate > 0.0:
-        raise UserError(f"--learning_rate must be above 0, is {options.learning_rate}")
+    if not 0.0 < options.learning_rate < math.inf:
+        raise UserError(f"--learning_rate must be above 0 and finite, is {options.learning_rate}")
     if not 0.0 <= options.gamma <= 1.0:
         raise UserError(f"--gamma must be in [0, 1], is {options.gamma}")
     values = options.values or {}
     for name in ("alpha", "noise", "noise_clip"):
-        if not values.get(name, 0.0) >= 0.0:
-            raise UserError(f"--{name} must not be negative, is {values[name]}")
+        if not 0.0 <= values.get(name, 0.0) < math.inf:
+            raise UserError(f"--{name} must be finite and not negative, is {values[name]}")
     if not 0.0 < values.get("tau", 1.0) <= 1.0:
         raise UserError(f"--tau must be above 0 and at most 1, is {values['tau']}")
+    check_device_name(options.device)
+    _check_encoder(options)
+
+
+def _check_encoder(options: OfflineOptions) -> None:
     for name in FRESH:
         if options.encoder is not None and getattr(options, name) is not None:
             raise UserError(f"--{name} is of an encoder that the agent trains; leave it out beside --encoder")
+        values = [options.fresh(name)] if name != "strides" else options.fresh(name)
+        if min(values, default=0) < 1:
+            raise UserError(f"--{name} must be at least 1, is {options.fresh(name)}")
     if options.encoder is None and options.copies > 1:
         raise UserError("--copies are of frames that a given encoder encodes once; leave it out without --encoder")
-    if options.film > options.episodes:
-        raise UserError(f"--film {options.film}: must be at most --episodes {options.episodes}")

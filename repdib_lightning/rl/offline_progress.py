@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ import lightning.pytorch as pl
 import numpy as np
 from tqdm import tqdm
 
+from repdib_lightning.errors import UserError
 from repdib_lightning.rl.options import PROGRESS
 from repdib_lightning.rl.td3_bc import BehaviourCloning
 
@@ -28,6 +30,9 @@ class OfflineProgress(pl.Callback):
 
     Attributes:
         returns: (n,) of the last evaluation; empty without one.
+
+    Raises:
+        UserError: losses or returns that are no longer finite, once they are looked at.
     """
 
     def __init__(self, folder: Path, every: int, steps: int, evaluate: Callable[[bool], np.ndarray] | None) -> None:
@@ -57,6 +62,9 @@ class OfflineProgress(pl.Callback):
             row |= {"eval/return": reached, "eval/normalised": reached / 10.0}
             self._bar.set_postfix_str(f"return {reached:.0f}")
         row |= {f"train/{name}": float(value) for name, value in pl_module.latest.items()}
+        lost = [name for name, value in row.items() if not math.isfinite(value)]
+        if lost:
+            raise UserError(f"{lost[0]} is {row[lost[0]]} after {done} updates; try a smaller --learning_rate")
         self.rows.append(row)
         if trainer.logger is not None:
             trainer.logger.log_metrics({name: value for name, value in row.items() if name != "step"}, step=done)

@@ -18,11 +18,14 @@ from repdib_lightning.bottlenecks import Identity
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.encoders import ConvolutionalEncoder
+from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation.features import check_compatible, resolve_device, stacked
 from repdib_lightning.export.bundle import save_bundle
+from repdib_lightning.export.frozen import FrozenEncoder
 from repdib_lightning.export.load import load_encoder
 from repdib_lightning.records import DataSpec
+from repdib_lightning.rl.devices import check_device
 from repdib_lightning.rl.episodes_at_once import EpisodesAtOnce
 from repdib_lightning.rl.film import side_by_side, write_film
 from repdib_lightning.rl.given_bundle import checked_bundle
@@ -53,21 +56,32 @@ class OfflineTraining:
 
     def __init__(self, options: OfflineOptions) -> None:
         self.options = options
+        check_device(options.device)
         self.device = resolve_device(options.device)
         self.store = EpisodeStore(options.data)
         rewarded = options.agent != "bc"
         self.transitions = Transitions(self.store, n_steps=options.n_steps, gamma=options.gamma, rewarded=rewarded)
+        self.transitions.check_batch(options.batch_size)
         bundle = checked_bundle(options.encoder)
-        self.frozen = None if bundle is None else load_encoder(bundle).to(self.device)
-        self.spec = self._fresh_spec() if self.frozen is None else self.frozen.spec
-        if self.frozen is not None:
-            check_compatible(self.frozen, self.store, str(options.encoder))
+        self.encoder: FrozenEncoder | Encoder
+        if bundle is None:
+            torch.manual_seed(options.seed)
+            self.encoder = self._fresh_encoder()
+        else:
+            self.encoder = load_encoder(bundle).to(self.device)
+            check_compatible(self.encoder, self.store, str(options.encoder))
         self.evaluation = self._open_evaluation()
+        try:
+            self.source, self.agent = self._build()
+        except BaseException:
+            self.close()
+            raise
 
-    def _fresh_spec(self) -> DataSpec:
+    def _fresh_encoder(self) -> Encoder:
         stack = self.options.fresh("frame_stack")
         pictures = {name: stacked(a, stack) for name, a in self.store.observations.items() if a.is_image}
-        return DataSpec(pictures, self.store.actions_spec, stack)
+        sizes = {name: self.options.fresh(name) for name in ("features", "channels", "strides")}
+        return ConvolutionalEncoder(DataSpec(pictures, self.store.actions_spec, stack), **sizes)
 
     def _open_evaluation(self) -> EpisodesAtOnce | None:
         options = self.options
@@ -77,38 +91,38 @@ class OfflineTraining:
         assert self.store.actions_spec is not None
         copies = open_all(*chosen, options.episodes, self.store.actions_spec.size)
         try:
-            return EpisodesAtOnce(copies, self.spec, options.seed + 1)
+            return EpisodesAtOnce(copies, self.encoder.spec, options.seed + 1)
         except UserError as error:
-            raise UserError(f"--encoder {options.encoder}: does not fit --env {chosen[0]}: {error}") from error
+            for copy in copies:
+                copy.close()
+            whose = f"--data {options.data}" if options.encoder is None else f"--encoder {options.encoder}"
+            raise UserError(f"{whose}: does not fit --env {chosen[0]}: {error}") from error
 
-    def build(self) -> BehaviourCloning:
-        """The agent, with its encoder or standardiser; encodes the data where the encoder is frozen."""
+    def _build(self) -> tuple[Latents | Pictures, BehaviourCloning]:
+        """What is seen of the data, encoded where the encoder is frozen; and the agent that sees it."""
         options = self.options
-        torch.manual_seed(options.seed)
+        source: Latents | Pictures
         features: StandardisedLatents | ShiftedPictures
-        if self.frozen is None:
-            encoder = ConvolutionalEncoder(
-                self.spec, **{name: options.fresh(name) for name in ("features", "channels", "strides")}
-            )
-            self.source: Latents | Pictures = Pictures(self.store, self.spec)
-            features, width = ShiftedPictures(encoder, options.shift), encoder.features
-        else:
+        if isinstance(self.encoder, FrozenEncoder):
             shifts = {"copies": options.copies, "shift": options.shift, "seed": options.seed}
-            self.source = latents = Latents(self.store, self.frozen, **shifts, progress=sys.stderr.isatty())
-            features, width = StandardisedLatents(latents.mean, latents.deviation), self.frozen.features
+            source = latents = Latents(self.store, self.encoder, **shifts, progress=sys.stderr.isatty())
+            features = StandardisedLatents(latents.mean, latents.deviation)
+        else:
+            source, features = Pictures(self.store, self.encoder.spec), ShiftedPictures(self.encoder, options.shift)
         assert self.store.actions_spec is not None
+        width, actions = self.encoder.features, self.store.actions_spec.size
         sizes: dict[str, Any] = {"hidden": options.hidden, "learning_rate": options.learning_rate}
         torch.manual_seed(options.seed)
         if options.agent == "bc":
-            return BehaviourCloning(features, width, self.store.actions_spec.size, **sizes)
+            return source, BehaviourCloning(features, width, actions, **sizes)
         sizes |= options.values or {}
-        return TD3BC(features, width, self.store.actions_spec.size, **sizes)
+        return source, TD3BC(features, width, actions, **sizes)
 
     def act(self, observations: dict[str, np.ndarray]) -> np.ndarray:
         """Actions (n, A) of the mean policy for name -> (n, *shape)."""
         with torch.inference_mode():
-            if self.frozen is not None:
-                seen: Any = self.frozen.encode(observations)
+            if isinstance(self.encoder, FrozenEncoder):
+                seen: Any = self.encoder.encode(observations)
             else:
                 seen = {name: torch.from_numpy(array).to(self.agent.device) for name, array in observations.items()}
             acted: np.ndarray = self.agent.act(seen).cpu().numpy()
@@ -119,7 +133,6 @@ class OfflineTraining:
         options = self.options
         with whole_file(folder / CONFIGURATION) as path:
             path.write_text(json.dumps(plain(asdict(options)), indent=1) + "\n")
-        self.agent = self.build()
         batches = TransitionBatches(
             self.store, self.transitions, self.source, options.batch_size, options.steps, options.seed
         )
@@ -129,9 +142,10 @@ class OfflineTraining:
             max_epochs=1,
             limit_train_batches=options.steps,
             accelerator="cpu" if self.device.type == "cpu" else self.device.type,
-            devices=1,
+            devices=1 if self.device.index is None else [self.device.index],
             logger=TensorBoardLogger(folder, name="", version=""),
             callbacks=[self.progress],
+            log_every_n_steps=min(50, options.steps),
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
@@ -141,7 +155,7 @@ class OfflineTraining:
 
     def _evaluate(self, folder: Path, evaluation: EpisodesAtOnce, last: bool) -> np.ndarray:
         """Returns (n,); the last time, some of the episodes are filmed."""
-        returns, films = evaluation.run(self.act, self.options.film if last else 0)
+        returns, films = evaluation.run(self.act, min(self.options.film, self.options.episodes) if last else 0)
         if films:
             write_film(folder / FILM, side_by_side(films))
         return returns
@@ -149,11 +163,11 @@ class OfflineTraining:
     def finish(self, folder: Path) -> dict[str, Any]:
         """Save the trained policy, and write what was reached; returns it."""
         save_policy(folder, self.agent.actor, self.agent.features, self.options)
-        if isinstance(self.agent.features, ShiftedPictures):
-            encoder = self.agent.features.encoder
+        if not isinstance(self.encoder, FrozenEncoder):
             training = {"agent": self.options.agent, "steps": self.options.steps}
-            save_bundle(folder / "bundle", encoder.cpu(), Identity(encoder.features), training=training, data={})
-            encoder.to(self.device)
+            bottleneck = Identity(self.encoder.features)
+            save_bundle(folder / "bundle", self.encoder.cpu(), bottleneck, training=training, data={})
+            self.encoder.to(self.device)
         measures: dict[str, float] = {}
         if self.evaluation is not None:
             returns, curve = self.progress.returns, self.progress.curve("eval/return")
@@ -163,7 +177,6 @@ class OfflineTraining:
                 "return_deviation": float(returns.std()),
                 "mean_return": float(curve.mean()),
             }
-            self.evaluation.close()
         measures["clone_error"] = float(self.progress.curve("train/clone")[-1])
         outcome = {
             "agent": self.options.agent,
@@ -177,3 +190,8 @@ class OfflineTraining:
         with whole_file(folder / OUTCOME) as path:
             path.write_text(json.dumps(outcome, indent=1, allow_nan=False) + "\n")
         return outcome
+
+    def close(self) -> None:
+        """Close the environments."""
+        if self.evaluation is not None:
+            self.evaluation.close()

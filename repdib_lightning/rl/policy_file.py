@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import nn
+from torch import Tensor, nn
 
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.errors import UserError
@@ -68,24 +67,32 @@ def load_policy(folder: str | Path, encoder: str | Path | None = None) -> Offlin
         with safe_open(path, framework="pt") as file:
             facts = json.loads((file.metadata() or {})["policy"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
-        shapes = [tensors[f"actor.network.{layer}.weight"].shape for layer in (0, 4)]
-    except (SafetensorError, KeyError, ValueError, OSError) as error:
-        raise UserError(f"{path}: not a policy of finetune td3bc or bc ({type(error).__name__}: {error})") from error
+        trained_on, standardise, actor = facts["encoder"], *_rebuilt(tensors)
+    except (SafetensorError, KeyError, ValueError, OSError, RuntimeError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{path}: not a policy of finetune td3bc or bc ({type(error).__name__}: {reason})") from error
     own = Path(folder) / "bundle"
-    named = encoder or (own if own.is_dir() else facts["encoder"])
-    bundle = Path(named) / "bundle" if (Path(named) / "bundle").is_dir() else Path(named)
+    if encoder is None and trained_on is None and not own.is_dir():
+        raise UserError(f"{folder}: its encoder, {own}, is missing; put it back, or name one")
+    named = Path(encoder or (trained_on if trained_on is not None else own))
+    bundle = named / "bundle" if (named / "bundle").is_dir() else named
     frozen = load_encoder(bundle)
-    width = int(shapes[0][1])
-    if frozen.features != width:
-        raise UserError(f"{bundle}: gives {frozen.features} features, the policy in {folder} takes {width}")
-    actor = Actor(width, int(shapes[1][0]), int(shapes[0][0]))
-    actor.load_state_dict(_part(tensors, "actor."))
-    standardise: nn.Module = nn.Identity()
-    if own_statistics := _part(tensors, "standardise."):
-        standardise = StandardisedLatents(torch.zeros(width), torch.ones(width))
-        standardise.load_state_dict(own_statistics)
+    if frozen.features != actor.features:
+        raise UserError(f"{bundle}: gives {frozen.features} features, the policy in {folder} takes {actor.features}")
     return OfflinePolicy(frozen, standardise, actor)
 
 
-def _part(tensors: dict[str, Any], prefix: str) -> dict[str, Any]:
+def _rebuilt(tensors: dict[str, Tensor]) -> tuple[nn.Module, Actor]:
+    """Standardiser and actor; whatever a dictionary or torch raises where tensors are missing or too many."""
+    hidden, width = tensors["actor.network.0.weight"].shape
+    actor = Actor(width, len(tensors["actor.network.4.bias"]), hidden)
+    actor.load_state_dict(_part(tensors, "actor."))
+    standardise: nn.Module = nn.Identity()
+    if statistics := _part(tensors, "standardise."):
+        standardise = StandardisedLatents(torch.zeros(width), torch.ones(width))
+        standardise.load_state_dict(statistics)
+    return standardise, actor
+
+
+def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

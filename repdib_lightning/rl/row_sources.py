@@ -55,13 +55,15 @@ class Latents:
             seen = encoder if copy == 0 else _Shifted(encoder, shift)
             encoded.append(encode_rows(seen, store, rows, device=encoder.device, progress=progress)[0])
         self.copies = np.stack(encoded)
-        self.mean = torch.from_numpy(self.copies.mean((0, 1)))
-        self.deviation = torch.from_numpy(self.copies.std((0, 1)))
+        # By torch, whose running sums stay exact over many rows, also where a dimension never varies.
+        self.deviation, self.mean = torch.std_mean(torch.from_numpy(self.copies), (0, 1), correction=0)
 
     def rows(self, rows: np.ndarray, random: np.random.Generator) -> Tensor:
         """(n,) rows to (n, M)."""
+        places = self._place[rows]
+        assert (places >= 0).all(), "only training rows are encoded"
         copy = random.integers(len(self.copies), size=len(rows))
-        return torch.from_numpy(self.copies[copy, self._place[rows]])
+        return torch.from_numpy(self.copies[copy, places])
 
 
 class Pictures:

@@ -42,7 +42,7 @@ class BehaviourCloning(pl.LightningModule):
     def training_step(self, batch: TransitionBatch, number: int) -> None:
         """One update."""
         loss = F.mse_loss(self.act(batch.seen), batch.actions)
-        _descend(self.optimizers(), loss)
+        _descend(self.optimizers(use_pl_optimizer=False), loss)
         self.latest = {"clone": loss.detach()}
 
     def _adam(self, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
@@ -92,7 +92,7 @@ class TD3BC(BehaviourCloning):
 
     def training_step(self, batch: TransitionBatch, number: int) -> None:
         """One update of the critic, one of the actor, one of the target."""
-        optimizers: Any = self.optimizers()
+        optimizers: Any = self.optimizers(use_pl_optimizer=False)
         of_critic, of_actor = optimizers
         seen = self.features(batch.seen)
         loss, value = self.critic_loss(seen, batch)
@@ -125,7 +125,7 @@ class TD3BC(BehaviourCloning):
         """Add clipped noise; the result stays in [-1, 1], with the gradient of the actions."""
         noise = (self.noise * torch.randn_like(actions)).clamp(-self.noise_clip, self.noise_clip)
         moved = actions + noise
-        return moved + (moved.clamp(-1.0, 1.0) - moved).detach()
+        return moved.detach().clamp(-1.0, 1.0) + (moved - moved.detach())
 
     @torch.no_grad()
     def follow(self) -> None:

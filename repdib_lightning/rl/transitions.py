@@ -53,19 +53,23 @@ class Transitions:
         rows, later: (N,) int64, t and t + m. returns, discounts: (N,) float32.
 
     Raises:
-        UserError: no continuous actions, or no rewards where they are needed.
+        UserError: no continuous actions in [-1, 1], or no rewards where they are needed.
     """
 
     def __init__(self, store: EpisodeStore, *, n_steps: int = 1, gamma: float = 0.99, rewarded: bool = True) -> None:
         if store.actions_spec is None or store.actions_spec.kind != "continuous":
-            raise UserError(f"{store.path}: offline agents need continuous actions, these are {store.actions_spec}")
-        if rewarded and "rewards" not in store._places:
+            kind = "there are none" if store.actions_spec is None else f"these are {store.actions_spec.kind}"
+            raise UserError(f"{store.path}: offline agents need continuous actions, {kind}")
+        if rewarded and "rewards" not in store:
             raise UserError(f"{store.path}: has no 'rewards', which this agent learns from; `finetune bc` needs none")
         chosen = store.episodes("train")
         starts, lengths = store.starts[chosen], store.lengths[chosen]
-        self.rows = np.concatenate([np.arange(s, s + n - 1) for s, n in zip(starts, lengths, strict=True)])
+        parts = [np.arange(s, s + n - 1) for s, n in zip(starts, lengths, strict=True)]
+        self.rows = np.concatenate([np.arange(0), *parts])
+        _check_bounds(store, self.rows)
         last = np.repeat(starts + lengths - 1, lengths - 1)
         self.later = np.minimum(self.rows + n_steps, last)
+        self.path = store.path
         self.returns = np.zeros(len(self.rows), np.float32)
         self.discounts = (gamma ** (self.later - self.rows)).astype(np.float32)
         if not rewarded:
@@ -74,12 +78,24 @@ class Transitions:
         for ahead in range(n_steps):
             inside = self.rows + ahead < last
             self.returns[inside] += gamma**ahead * rewards[self.rows[inside] + ahead]
-        if "terminations" in store._places:
+        if "terminations" in store:
             ended = np.asarray(store.array("terminations")[:])
             self.discounts[(self.later == last) & ended[last - 1]] = 0.0
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def check_batch(self, batch_size: int) -> None:
+        """Raise UserError where a batch is larger than the data."""
+        if batch_size > len(self):
+            raise UserError(f"--batch_size {batch_size}: {self.path} has {len(self)} transitions to train on")
+
+
+def _check_bounds(store: EpisodeStore, rows: np.ndarray) -> None:
+    """What an actor gives is in [-1, 1]; it cannot repeat anything else."""
+    largest = float(np.abs(store.gather("actions", rows)).max(initial=0.0))
+    if not largest <= 1.0 + 1e-6:
+        raise UserError(f"{store.path}: offline agents need actions in [-1, 1], here is one of size {largest:.4g}")
 
 
 class TransitionBatches:
@@ -91,16 +107,11 @@ class TransitionBatches:
         batch_size: B.
         steps: batches.
         seed: of the draws.
-
-    Raises:
-        UserError: a batch larger than the data.
     """
 
     def __init__(
         self, store: EpisodeStore, transitions: Transitions, source: RowSource, batch_size: int, steps: int, seed: int
     ) -> None:
-        if batch_size > len(transitions):
-            raise UserError(f"--batch_size {batch_size}: {store.path} has {len(transitions)} transitions to train on")
         self.transitions, self.source = transitions, source
         self.batch_size, self.steps, self.seed = batch_size, steps, seed
         self.actions = np.asarray(store.gather("actions", transitions.rows), np.float32)
