@@ -31,8 +31,8 @@ class SVIB(Bottleneck):
     below by a network that is trained beside it. Evaluation gives the mean.
 
     One optimiser plays both sides, which are two losses: ``information``, the estimate with the network held fixed,
-    which mean, deviation and encoder descend (weight beta, 0.01 unless configured); ``estimator``, minus the estimate
-    at fixed h and z, by which the network ascends (weight 1; leave it there, with a weight of 0 nothing is estimated).
+    which mean, deviation and encoder descend (weight beta, see ``DEFAULT_LOSS_WEIGHTS``); ``estimator``, minus the
+    estimate at fixed h and z, by which the network ascends (weight 1; leave it there, with 0 nothing is estimated).
     Rows of neighbouring frames count as strangers too; in a batch of many episodes these are few.
 
     Metrics: ``sigma``, ``mean_rms`` and ``kl_nats`` as those of :class:`Variational`; the divergence is not a loss.

@@ -52,6 +52,8 @@ class DynamicBottleneck(Objective):
     q and r approach their lower bounds of 0.001 and 0.1 smoothly instead of being cut there. The code is no part of
     what is exported: a frozen encoder gives the latent that DB has shaped. There is no intrinsic reward.
 
+    Weights: a tenth of the published program's, see ``DEFAULT_LOSS_WEIGHTS``.
+
     Nothing alone prevents latents from becoming constant but ``db_contrast``, which then stays at log N; use it beside
     an objective that needs the state, in ``SeveralObjectives``.
 

@@ -45,7 +45,7 @@ def test_the_network_moves_by_the_estimator_alone_and_everything_else_by_the_inf
 def test_the_two_losses_are_one_estimate_with_opposite_signs():
     output = built()(latents())
     torch.testing.assert_close(output.losses["information"], -output.losses["estimator"])
-    assert DEFAULT_LOSS_WEIGHTS["information"] == 0.01 and "estimator" not in DEFAULT_LOSS_WEIGHTS
+    assert DEFAULT_LOSS_WEIGHTS["information"] == 1e-4 and "estimator" not in DEFAULT_LOSS_WEIGHTS
 
 
 def train(bottleneck, weights, steps=300):

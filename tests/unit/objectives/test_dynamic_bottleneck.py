@@ -50,7 +50,7 @@ def train(objective, steps=300, **weights):
 
 
 def test_the_code_keeps_what_goes_on_and_drops_what_does_not():
-    """The published weights of the three terms, which are equal."""
+    """At equal weights of the three terms, as published."""
     objective = built()
     output = train(objective)
     assert output.metrics["db_contrast_nats"] > 0.2 and output.losses["db_kl"] > 0.3
