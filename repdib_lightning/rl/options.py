@@ -47,6 +47,9 @@ class DQNOptions:
         return cls(**{name: given[name] for name in cls.__dataclass_fields__})
 
 
+FRESH = tuple(name for name in FRESH_OPTIONS if name in DQNOptions.__dataclass_fields__)
+"""Options of a fresh encoder."""
+
 _COUNTS = ("steps", "batch_size", "hidden", "buffer_size", "train_freq", "n_steps", "evaluate_every")
 _SHARES = ("gamma", "tau", "exploration_fraction", "exploration_final_eps")
 
@@ -77,7 +80,7 @@ def check_options(options: DQNOptions) -> None:
         raise UserError(f"--n_steps {options.n_steps}: Stable-Baselines3 keeps longer returns with --frozen only")
     if options.frozen and options.encoder is None:
         raise UserError("--frozen needs --encoder BUNDLE: a fresh encoder that is never trained knows nothing")
-    for name in FRESH_OPTIONS:
+    for name in FRESH:
         if options.encoder is not None and getattr(options, name) is not None:
             raise UserError(f"--{name}: is of a fresh encoder, --encoder {options.encoder} has its own; leave it out")
 

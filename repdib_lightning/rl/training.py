@@ -20,7 +20,6 @@ from repdib_lightning.export.frozen import FrozenEncoder
 from repdib_lightning.export.gymnasium_wrapper import EncodeObservation, PrepareObservation
 from repdib_lightning.export.load import load_encoder
 from repdib_lightning.records import DataSpec
-from repdib_lightning.rl import FRESH_OPTIONS
 from repdib_lightning.rl.devices import check_device
 from repdib_lightning.rl.dqn import BottleneckDQN
 from repdib_lightning.rl.encoders import fresh_description, load_into
@@ -28,7 +27,7 @@ from repdib_lightning.rl.environment import check_discrete, maze_of, open_enviro
 from repdib_lightning.rl.evaluation import EpisodeEvaluation, MazeEvaluation
 from repdib_lightning.rl.features import BottleneckFeatures
 from repdib_lightning.rl.given_bundle import checked_bundle
-from repdib_lightning.rl.options import CONFIGURATION, OUTCOME, DQNOptions, plain
+from repdib_lightning.rl.options import CONFIGURATION, FRESH, OUTCOME, DQNOptions, plain
 from repdib_lightning.rl.progress import POLICY, Progress
 from repdib_lightning.rl.visits import CountVisits
 from repdib_lightning.versions import versions
@@ -58,7 +57,7 @@ class Training:
             space = bare.observation_space
             self.description = fresh_description(space, options.features, options.channels, options.strides)
             sizes = self.description["encoder"]["arguments"]
-            self.options = options = replace(options, **{name: sizes[name] for name in FRESH_OPTIONS})
+            self.options = options = replace(options, **{name: sizes[name] for name in FRESH})
         else:
             self.description = self.pretrained.description
         self.spec = DataSpec.from_dict(self.description["spec"])
