@@ -34,6 +34,9 @@ def one_line(error: BaseException, options: Iterable[str], classes: dict[str, li
         return UserError(f"{key}: unknown class '{name}', {nearest(name, classes.get(keys[0], []))}")
     if match := re.search(r"Expected an import path or a subclass spec, but got (.*?)\. Got value", text):
         return UserError(f"{key}: expected a class, got '{match[1]}', {nearest(match[1], classes.get(keys[0], []))}")
+    if match := re.search(r"Expected a typing\.Literal\[(.*?)\]\. Got value: (.*)", text):
+        choices = re.findall(r"'([^']*)'", match[1])
+        return UserError(f"{key}: unknown '{match[2]}', {nearest(match[2], choices)}")
     if match := re.search(r"Expected an? (?:<class ')?([\w.]+)'?>?\. Got value: (.*)", text):
         return UserError(f"{key}: expected {match[1]}, got '{match[2].split(' Got value')[0].strip().rstrip('.')}'")
     plain = re.search(r"Subtypes: \[((?:<class '(?:int|float|str|bool|NoneType)'>(?:, )?)+)\]", text)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from stat import S_IMODE
 
 from repdib_lightning.errors import UserError
 
@@ -56,7 +57,10 @@ def whole_file(path: Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
+            temporary.touch()
+            mode = S_IMODE(temporary.stat().st_mode)  # of any new file; some libraries make theirs unreadable to others
             yield temporary
+            temporary.chmod(mode)
             sync_file(temporary)
             os.replace(temporary, path)
             sync_directory(path.parent)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +63,13 @@ class PolicyFile:
     @property
     def replay(self) -> list[str]:
         """Names of the networks on the way to ``medium``, in the order of training."""
-        return sorted((name for name in self.networks if name.startswith("replay_")), key=lambda n: int(n[7:]))
+        return sorted((name for name in self.networks if re.fullmatch(r"replay_\d+", name)), key=lambda n: int(n[7:]))
+
+    def network(self, name: str) -> Network:
+        """One of the networks. Raises UserError if it is not there."""
+        if name not in self.networks:
+            raise UserError(f"--policy {self.path}: has no network '{name}', {nearest(name, self.networks)}")
+        return self.networks[name]
 
 
 def packaged_policy(task: str) -> Path:
@@ -135,4 +142,10 @@ def _network(tensors: Mapping[str, np.ndarray], name: str) -> Network:
         raise ValueError(f"'{name}' has {len(layers)} layers, at least 3 are needed")
     weights = tuple(tensors[f"{name}/{layer}/weight"] for layer in layers)
     biases = tuple(tensors[f"{name}/{layer}/bias"] for layer in layers)
+    sources = [*weights[:-2], weights[-3]]  # the mean and the deviation are computed from the same hidden layer
+    fits = all(w.ndim == 2 and b.shape == w.shape[:1] for w, b in zip(weights, biases, strict=True))
+    if not (fits and all(w.shape[1] == s.shape[0] for w, s in zip(weights[1:], sources, strict=True))):
+        raise ValueError(f"the layers of '{name}' do not fit each other")
+    if not (weights[-1].shape == weights[-2].shape and all(np.isfinite(v).all() for v in (*weights, *biases))):
+        raise ValueError(f"'{name}' holds values that are not finite, or as many means as deviations")
     return Network(weights, biases)

@@ -57,7 +57,7 @@ class ControlRecording:
     @cached_property
     def steps(self) -> int:
         """Actions an episode."""
-        return ControlTask(self.task, self.action_repeat).steps or 1000 // self.action_repeat
+        return ControlTask(self.task, self.action_repeat).steps
 
     @property
     def episodes(self) -> int:
@@ -90,12 +90,13 @@ class ControlRecording:
         """Who plays an episode: the older half of ``medium_expert`` is the medium one's, as in V-D4RL's files."""
         share = episode / self.episodes
         if self.behaviour == "medium_replay":
-            name = policies.replay[int(share * len(policies.replay))]
+            replay = policies.replay or ["replay_0"]
+            name = replay[int(share * len(replay))]
         elif self.behaviour == "medium_expert":
             name = "medium" if share < 0.5 else "expert"
         else:
             name = self.behaviour
-        return policies.networks[name]
+        return policies.network(name)
 
     def open(self) -> Callable[[int], dict[str, Any]]:
         """Open the simulator in this process: a function that plays and films an episode."""
@@ -159,12 +160,13 @@ def collect_control(
     """
     if behaviour not in BEHAVIOURS:
         raise UserError(f"behaviour={behaviour}: unknown, {nearest(behaviour, BEHAVIOURS)}")
-    for name, value, least in (("samples", samples, 1), ("seed", seed, 0), ("workers", workers, 1)):
+    for option, value, least in (("samples", samples, 1), ("seed", seed, 0), ("workers", workers, 1)):
         if value < least:
-            raise UserError(f"{name}={value}: must be at least {least}")
-    chosen, digest = _policy(ControlTask(task, action_repeat).name, behaviour, policy)
+            raise UserError(f"{option}={value}: must be at least {least}")
+    name = ControlTask(task, action_repeat).name
+    chosen, digest = _policy(name, behaviour, policy)
     recording = ControlRecording(
-        ControlTask(task, action_repeat).name,
+        name,
         behaviour,
         samples,
         image_size,
@@ -201,20 +203,21 @@ def record_episode(
     rewards: list[float] = []
     terminations: list[bool] = []
     truncations: list[bool] = []
+    ended = False
     while True:
         picture = backgrounds.shown(camera.see(task), playing, len(rows))
         factors = {**task.factors(), **backgrounds.factors(playing, len(rows))}
         rows.append({"picture": picture, "mask": _widened(camera.agent_mask(task), backgrounds.panel), **factors})
-        if len(actions) == recording.steps:
+        if ended:
             break
-        action = random.uniform(-1.0, 1.0, task.actions) if network is None else network.act(task.state(), random)
+        drawn = random.uniform(-1.0, 1.0, task.actions) if network is None else network.act(task.state(), random)
+        action = drawn.astype(np.float32)  # before it is played, so that the stored ones lead to the stored states
         reward, terminated, truncated = task.step(action)
-        if (terminated or truncated) and len(actions) + 1 < recording.steps:
-            raise UserError(f"task {task.name}: episodes end at different times, which a recording cannot hold")
-        actions.append(action.astype(np.float32))
+        ended = terminated or truncated
+        actions.append(action)
         rewards.append(reward)
         terminations.append(terminated)
-        truncations.append(not terminated and (truncated or len(actions) == recording.steps))
+        truncations.append(truncated)
     joined = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     return {
         "observations": {VIEW: joined.pop("picture")},
@@ -239,16 +242,20 @@ def _policy(task: str, behaviour: Behaviour, policy: Path | None) -> tuple[str, 
             raise UserError(f"--policy {policy}: random actions need none; choose another --behaviour")
         return "", ""
     chosen = packaged_policy(task) if policy is None else policy
-    if not chosen.is_file():
-        raise UserError(f"--policy {chosen}: no such file")
-    return str(chosen), hashlib.sha256(chosen.read_bytes()).hexdigest()[:16]
+    try:
+        return str(chosen), hashlib.sha256(chosen.read_bytes()).hexdigest()[:16]
+    except OSError as error:
+        raise UserError(f"--policy {chosen}: cannot be read ({error.strerror or error})") from error
 
 
 def _writer(path: str | Path, recording: ControlRecording, overwrite: bool) -> EpisodeWriter:
     environment = recording.environment()
     shape = environment.observation_space.shape
     assert shape is not None
-    recording.policies(environment.task)  # what is wrong with them shows here and not in a worker
+    policies = recording.policies(environment.task)  # what is wrong with them shows here and not in a worker
+    if policies is not None:
+        for episode in (0, recording.episodes - 1):
+            recording.network_of(episode, policies)
     states = {name: FactorSpec("endogenous", "continuous", width=n) for name, n in environment.task.sizes.items()}
     actions, factors = environment.task.actions, {**states, **environment.backgrounds.factor_specs()}
     environment.close()

@@ -9,9 +9,12 @@ import numpy as np
 
 from repdib_lightning.environments.control_background import Backgrounds, Playing
 from repdib_lightning.environments.control_background import Kind as Distractors
-from repdib_lightning.environments.control_scene import ControlCamera, Place, Quality
+from repdib_lightning.environments.control_scene import ControlCamera, Place, Quality, check_picture
 from repdib_lightning.environments.control_task import ControlTask
 from repdib_lightning.errors import UserError
+
+_STARTS_TRIED = 8
+"""Starts of episodes in which the sky is looked for."""
 
 
 class ControlEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -36,7 +39,8 @@ class ControlEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_mode: ``rgb_array`` or None.
 
     Raises:
-        UserError: an argument out of range, unreadable distractors, MuJoCo 4, or no renderer.
+        UserError: an argument out of range, unreadable distractors or ones that would never be seen, MuJoCo 4, or no
+            renderer.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (gymnasium's own convention)
@@ -58,21 +62,36 @@ class ControlEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, "rgb_array"):
             raise UserError(f"render_mode={render_mode}: must be rgb_array or None")
         self.render_mode, self.evaluation = render_mode, evaluation
+        check_picture(image_size, quality)
         self.task = ControlTask(task, action_repeat)
         self.backgrounds = Backgrounds(distractors, place, source, distractor_seed, image_size)
         self.camera = ControlCamera(self.task, image_size, quality, self.backgrounds.through)
+        self._check_place()
         shape = (3, image_size, image_size + self.backgrounds.panel)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.task.actions,), np.float32)
         self._playing, self._step = Playing(0, 0), 0
+
+    def _check_place(self) -> None:
+        """Refuse a sky that the camera, looking down, does not see."""
+        if not self.backgrounds.through:
+            return
+        for seed in range(_STARTS_TRIED):
+            self.task.reset(np.random.default_rng(seed))
+            if self.camera.see(self.task).through.any():
+                return
+        self.close()
+        raise UserError(f"place=sky: nothing of the sky is seen in {self.task.name}; choose sky_floor or side")
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode, with another distractor."""
         super().reset(seed=seed)
-        self.task.reset(self.np_random)
-        self._playing, self._step = self.backgrounds.draw(self.np_random, self.evaluation), 0
+        # Apart, so that what an episode shows does not decide how the next one starts.
+        physics, drawing = (np.random.default_rng(part) for part in self.np_random.integers(2**63, size=2))
+        self.task.reset(physics)
+        self._playing, self._step = self.backgrounds.draw(drawing, self.evaluation), 0
         return self._observe(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:

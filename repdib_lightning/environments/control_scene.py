@@ -27,8 +27,8 @@ class Seen:
     """What the camera sees.
 
     Attributes:
-        picture: (H, W, 3) uint8; black where it is seen through.
-        through: (H, W, 1) share of each pixel, 0 to 1, that shows what is behind; bool where nothing is mixed.
+        picture: (H, W, 3), 0 to 255; black where it is seen through. uint8; float32 where pixels are mixed.
+        through: (H, W, 1) share of each pixel, 0 to 1, that shows what is behind, float32; bool where nothing is mixed.
     """
 
     picture: np.ndarray
@@ -60,10 +60,7 @@ class ControlCamera:
     """
 
     def __init__(self, task: ControlTask, size: int, quality: Quality = "fast", through: str = "") -> None:
-        if quality not in QUALITIES:
-            raise UserError(f"quality={quality}: unknown, {nearest(quality, QUALITIES)}")
-        if not 16 <= size <= 512:
-            raise UserError(f"image_size={size}: must be from 16 to 512")
+        check_picture(size, quality)
         self._quality, self._size, self._through = quality, size, through
         self._number = task.camera
         model = task.model
@@ -75,7 +72,8 @@ class ControlCamera:
             if key:
                 _paint(model, sky, key)
             self._renderers.append(SceneRenderer(model, size, size, effects=quality == "paper"))
-        self._agent = model.geom_bodyid != 0
+        self._agent = model.body_weldid[model.geom_bodyid] != 0
+        self._terrain = model.hfield_data.copy()
 
     def dress(self, task: ControlTask) -> None:
         """Set a task's model to this camera's quality; needed once for every task that it films."""
@@ -93,6 +91,7 @@ class ControlCamera:
 
     def see(self, task: ControlTask) -> Seen:
         """Film the task as it stands."""
+        self._follow_terrain(task.model)
         pictures = [renderer.picture(task.data, self._number, task.model) for renderer in self._renderers]
         if not self._through:
             return Seen(pictures[0], np.zeros((self._size, self._size, 1), bool))
@@ -105,8 +104,16 @@ class ControlCamera:
 
     def agent_mask(self, task: ControlTask) -> np.ndarray:
         """(H, W) bool: pixels of whatever can move."""
+        self._follow_terrain(task.model)
         _, geoms = self._renderers[0].picture_and_geoms(task.data, self._number, task.model)
         return np.where(geoms >= 0, self._agent[geoms], False)
+
+    def _follow_terrain(self, model: Any) -> None:
+        """Some tasks draw another terrain for every episode; it lies in the graphics memory."""
+        if not np.array_equal(model.hfield_data, self._terrain):
+            self._terrain = model.hfield_data.copy()
+            for renderer in self._renderers:
+                renderer.upload_terrain(model)
 
     def close(self) -> None:
         """Free the graphics memory."""
@@ -120,6 +127,14 @@ class ControlCamera:
         if not len(found):
             raise UserError("place: this task has no sky; put the distractor at its side (place side)")
         return int(found[0])
+
+
+def check_picture(size: int, quality: str) -> None:
+    """Raise UserError for a size in pixels that is out of range, or an unknown quality."""
+    if quality not in QUALITIES:
+        raise UserError(f"quality={quality}: unknown, {nearest(quality, QUALITIES)}")
+    if not 16 <= size <= 512:
+        raise UserError(f"image_size={size}: must be from 16 to 512")
 
 
 def _paint(model: Any, texture: int, colour: tuple[int, ...]) -> None:

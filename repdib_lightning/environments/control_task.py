@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -26,10 +30,11 @@ class ControlTask:
         name: ``domain-task``. camera: number of the camera that films it.
         actions: A; each dimension in [-1, 1], scaled to the task's own bounds.
         sizes: name -> width of what the task observes of its state (positions, velocities, touch, ...).
-        steps: actions until an episode is truncated; 0 where the task never ends.
+        steps: actions until an episode is truncated.
 
     Raises:
-        UserError: an unknown task, an action repeat below 1, MuJoCo 4, or no OpenGL backend to import.
+        UserError: an unknown task, one that never ends (``lqr``), an action repeat below 1, MuJoCo 4, or no OpenGL
+            backend to import.
     """
 
     def __init__(self, name: str, action_repeat: int = 2) -> None:
@@ -39,12 +44,15 @@ class ControlTask:
         suite = load_suite()
         domain, task = _find(name, suite.ALL_TASKS)
         self.name, self.camera = SEPARATOR.join((domain, task)), _CAMERAS.get(domain, 0)
-        self._environment = suite.load(domain, task, task_kwargs={"random": 0})
+        with _without_deprecations():
+            self._environment = suite.load(domain, task, task_kwargs={"random": 0})
         bounds = self._environment.action_spec()
         self._low, self._high = bounds.minimum.astype(np.float64), bounds.maximum.astype(np.float64)
         self.actions = len(self._low)
         limit = self._environment._step_limit
-        self.steps = -(-int(limit) // action_repeat) if np.isfinite(limit) else 0
+        if not np.isfinite(limit):
+            raise UserError(f"task {self.name}: its episodes never end and its actions have no bounds; choose another")
+        self.steps = math.ceil(limit / action_repeat)
         self._seen = self._environment.reset().observation
         self.sizes = {key: int(np.size(value)) for key, value in self._seen.items()}
 
@@ -78,7 +86,8 @@ class ControlTask:
             if moment.last():
                 break
         self._seen = moment.observation
-        return reward, moment.last() and moment.discount == 0.0, moment.last() and moment.discount != 0.0
+        terminated = bool(moment.last() and moment.discount == 0.0)
+        return reward, terminated, moment.last() and not terminated
 
     def factors(self) -> dict[str, np.ndarray]:
         """Name -> (width,) float32: what the task observes of its state."""
@@ -89,16 +98,31 @@ class ControlTask:
         return np.concatenate(list(self.factors().values()))
 
 
+@contextmanager
+def _without_deprecations() -> Iterator[None]:
+    """Keep back what MuJoCo says of attributes in the suite's own files, which a user cannot change."""
+    log = logging.getLogger("absl")
+    log.addFilter(_is_of_use)
+    try:
+        yield
+    finally:
+        log.removeFilter(_is_of_use)
+
+
+def _is_of_use(record: logging.LogRecord) -> bool:
+    return "is deprecated and will be removed" not in record.getMessage()
+
+
 def load_suite() -> Any:
     """Import ``dm_control.suite``, once MuJoCo is known to be of a version that it works with.
 
     Raises:
-        UserError: MuJoCo 4, or no OpenGL backend that can be imported.
+        UserError: MuJoCo 4, or no OpenGL backend that can be used.
     """
     prepare_rendering()
     try:
         from dm_control import suite
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, RuntimeError, OSError) as error:  # it opens the renderer, too
         raise no_renderer(error) from error
     return suite
 

@@ -148,6 +148,12 @@ class SceneRenderer:
         self._context.make_current()
         self._mujoco.mjr_uploadTexture(self.model, self._resources, texture)
 
+    def upload_terrain(self, model: Any) -> None:
+        """Hand the current height fields of a model like the renderer's own to the graphics driver."""
+        self._context.make_current()
+        for field in range(model.nhfield):
+            self._mujoco.mjr_uploadHField(model, self._resources, field)
+
     def picture(self, data: Any, camera: int, model: Any = None) -> np.ndarray:
         """(H, W, 3) uint8: the scene in ``data`` seen from a camera of the model.
 
@@ -162,7 +168,7 @@ class SceneRenderer:
     def picture_and_geoms(self, data: Any, camera: int, model: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, 3) uint8 picture, and (H, W) int64: the geom seen at each pixel, -1 where there is none.
 
-        Takes what :meth:`picture` takes.
+        Where a skin is seen, that is the first geom of the first body that it covers. Takes what :meth:`picture` takes.
         """
         self._aim(data, camera, model)
         picture = self._draw()
@@ -176,11 +182,13 @@ class SceneRenderer:
 
     def _list_segments(self) -> np.ndarray:
         """(segments + 1,) int64: geom of each number in a segmented picture; the scene's order of geoms is fixed."""
-        geom_type = int(self._mujoco.mjtObj.mjOBJ_GEOM)
+        kinds, model = self._mujoco.mjtObj, self.model
         lookup = np.full(self._scene.ngeom + 1, -1, dtype=np.int64)
         for geom in self._scene.geoms[: self._scene.ngeom]:
-            if geom.segid >= 0 and geom.objtype == geom_type:
+            if geom.segid >= 0 and geom.objtype == kinds.mjOBJ_GEOM.value:
                 lookup[geom.segid + 1] = geom.objid
+            elif geom.segid >= 0 and geom.objtype == kinds.mjOBJ_SKIN.value:
+                lookup[geom.segid + 1] = model.body_geomadr[model.skin_bonebodyid[model.skin_boneadr[geom.objid]]]
         return lookup
 
     def _aim(self, data: Any, camera: int, model: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -47,7 +48,8 @@ def train_policies(
         hidden: width of the two hidden layers.
         learning_rate: Adam's.
         seed: of everything.
-        evaluate_every: steps between evaluations, each of which may become one of the kept networks.
+        evaluate_every: steps between evaluations, each of which may become one of the kept networks; the untrained and
+            the last network are evaluated too.
         threads: of torch.
         overwrite: replace an existing file.
         progress: show a progress bar.
@@ -62,22 +64,24 @@ def train_policies(
     check_output_file(path, "policies", ".safetensors", [])
     if path.exists() and not overwrite:
         raise UserError(f"{path}: exists already; choose another file or pass --overwrite")
-    for name, value in (("steps", steps), ("hidden", hidden), ("evaluate_every", evaluate_every), ("threads", threads)):
-        if value < 1:
-            raise UserError(f"{name}={value}: must be at least 1")
+    _check({"steps": steps, "hidden": hidden, "evaluate_every": evaluate_every, "threads": threads})
+    if not (learning_rate > 0 and math.isfinite(learning_rate)):
+        raise UserError(f"learning_rate={learning_rate}: must be above 0")
+    if not 0 <= seed < 2**32:
+        raise UserError(f"seed={seed}: must be from 0 to {2**32 - 1}")
     environment = ControlStateEnv(task, action_repeat)
     agent = _agent(environment, hidden, learning_rate, seed, threads)
     kept: list[tuple[int, float, Network]] = []
     with tqdm(total=steps, unit=" steps", desc=f"SAC {task}", disable=not (progress and sys.stderr.isatty())) as bar:
-        for done in range(0, steps + 1, evaluate_every):
+        for done in (*range(0, steps, evaluate_every), steps):
             if done:
-                agent.learn(evaluate_every, reset_num_timesteps=False)
-                bar.update(evaluate_every)
+                agent.learn(done - kept[-1][0], reset_num_timesteps=False)
+                bar.update(done - kept[-1][0])
             network = network_of(agent)
             reached = mean_return(ControlStateEnv(task, action_repeat), network, seed)
             kept.append((done, reached, network))
             bar.set_postfix_str(f"return {reached:.0f}")
-            if not bar.disable or progress:
+            if progress:
                 bar.write(f"{task}: {done} steps, return {reached:.0f}", file=sys.stderr)
     chosen = choose([reached for _, reached, _ in kept])
     facts: dict[str, Any] = {
@@ -91,6 +95,12 @@ def train_policies(
     }
     write_policies(path, facts, {name: kept[i][2] for name, i in chosen.items()})
     return path
+
+
+def _check(counts: Mapping[str, int]) -> None:
+    for name, value in counts.items():
+        if value < 1:
+            raise UserError(f"{name}={value}: must be at least 1")
 
 
 def choose(returns: Sequence[float]) -> dict[str, int]:
@@ -125,13 +135,14 @@ def network_of(agent: Any) -> Network:
 def _agent(environment: ControlStateEnv, hidden: int, learning_rate: float, seed: int, threads: int) -> Any:
     try:
         from stable_baselines3 import SAC
+        from stable_baselines3.common.logger import Logger
     except ImportError as error:
         raise UserError("collect policies needs Stable-Baselines3: pip install 'repdib_lightning[rl]'") from error
     import torch
 
     torch.set_num_threads(threads)
     network: Mapping[str, Any] = {"net_arch": [hidden, hidden], "optimizer_kwargs": {"fused": True}}
-    return SAC(
+    agent = SAC(
         "MlpPolicy",
         environment,
         learning_rate=learning_rate,
@@ -140,3 +151,5 @@ def _agent(environment: ControlStateEnv, hidden: int, learning_rate: float, seed
         seed=seed,
         device="cpu",
     )
+    agent.set_logger(Logger(folder=None, output_formats=[]))  # its own leaves a folder in /tmp at each learn
+    return agent
