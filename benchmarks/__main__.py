@@ -24,10 +24,11 @@ COMMANDS = {
     "encoding": ["encoding"],
     "start": ["start"],
     "mazes": ["mazes"],
+    "offline_agents": ["offline_agents"],
     "offline_run": ["offline_run"],
 }
 ON = {
-    "cpu": ["quantiser", "quantiser_kept", "data_path", "training_step", "encoding", "start", "mazes"],
+    "cpu": ["quantiser", "quantiser_kept", "data_path", "training_step", "encoding", "start", "mazes", "offline_agents"],
     "cuda": ["quantiser", "data_path", "training_step", "encoding", "offline_run"],
 }
 ROOT = Path(__file__).parent.parent

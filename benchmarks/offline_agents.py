@@ -58,7 +58,7 @@ def write_store(path: Path, frames: int, size: int) -> EpisodeStore:
 def updates_of(agent: TD3BC, batches: TransitionBatches, count: int) -> Callable[[], None]:
     """Updates from consecutive batches, gathering included."""
     optimizers = agent.configure_optimizers()
-    agent.optimizers = lambda: optimizers  # type: ignore[method-assign, assignment, return-value]
+    agent.optimizers = lambda **_: optimizers  # type: ignore[method-assign, assignment, return-value]
     numbers = iter(range(10**9))
 
     def update() -> None:
@@ -115,8 +115,8 @@ def main() -> None:
         memory = resident("VmHWM")
     print(
         f"{machine()}. 84 px, three frames, DrQ-v2's encoder, batches of 256, {options.frames} frames; median of "
-        f"{options.rounds} rounds in turn. Hours are of {UPDATES} updates; those on latents include encoding every frame "
-        "once.\n"
+        f"{options.rounds} rounds in turn. Hours are of {UPDATES} updates; those on latents include encoding every "
+        "frame once.\n"
     )
     header = ["hidden", "end to end ms", "latents ms", "encoding s", "end to end h", "latents h", "ratio"]
     print(table(header, rows) + "\n")

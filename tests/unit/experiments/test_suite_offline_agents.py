@@ -90,7 +90,7 @@ def test_the_report_holds_the_films_of_the_settings_that_are_named(tmp_path):
     page = (output / "report.html").read_text()
     assert page.count("<video") == 2 and (output / "films.png").is_file()
     assert "[film-tail-vq-walk](film-tail-vq-walk.mp4)" in (output / "report.md").read_text()
-    with pytest.raises(UserError, match="films.*'head/vq'"):
+    with pytest.raises(UserError, match=r"films.*'head/vq'"):
         read_suite(write(tmp_path, films=["head/vq"]))
 
 
