@@ -86,7 +86,7 @@ def finetune_td3bc(
 
     Raises:
         UserError: a bad option, a store without what is needed, a bundle or an environment that does not fit it;
-            nothing is left behind then.
+            nothing is left behind then. Or losses that are no longer finite; the folder stays then, without an outcome.
     """
     return _train("td3bc", locals())
 

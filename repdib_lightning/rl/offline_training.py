@@ -151,6 +151,7 @@ class OfflineTraining:
             enable_model_summary=False,
         )
         trainer.fit(self.agent, train_dataloaders=batches)
+        (folder / TensorBoardLogger.NAME_HPARAMS_FILE).unlink(missing_ok=True)  # says nothing
         self.agent.eval().to(self.device)
 
     def _evaluate(self, folder: Path, evaluation: EpisodesAtOnce, last: bool) -> np.ndarray:

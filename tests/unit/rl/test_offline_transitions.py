@@ -86,6 +86,15 @@ def test_data_that_do_not_say_what_terminated_were_truncated(tmp_path):
     assert Transitions(EpisodeStore(path), n_steps=3).discounts.min() == pytest.approx(0.99**3)
 
 
+def test_what_stands_at_the_last_row_of_an_episode_is_no_reward(store, tmp_path):
+    """No action is taken there; other programs write what they like."""
+    path = write_offline(tmp_path / "a.h5")
+    with h5py.File(path, "a") as file:
+        file["rewards"][store.starts + store.lengths - 1] = 1e6
+    found, wanted = (Transitions(s, n_steps=3) for s in (EpisodeStore(path), store))
+    np.testing.assert_array_equal(found.returns, wanted.returns)
+
+
 @pytest.mark.parametrize(
     ("actions", "said"), [(ActionSpec("discrete", 3), "these are discrete"), (None, "there are none")]
 )
