@@ -28,7 +28,16 @@ COMMANDS = {
     "offline_run": ["offline_run"],
 }
 ON = {
-    "cpu": ["quantiser", "quantiser_kept", "data_path", "training_step", "encoding", "start", "mazes", "offline_agents"],
+    "cpu": [
+        "quantiser",
+        "quantiser_kept",
+        "data_path",
+        "training_step",
+        "encoding",
+        "start",
+        "mazes",
+        "offline_agents",
+    ],
     "cuda": ["quantiser", "data_path", "training_step", "encoding", "offline_run"],
 }
 ROOT = Path(__file__).parent.parent

@@ -73,7 +73,9 @@ def contenders(store: EpisodeStore, hidden: int, strides: list[int]) -> tuple[di
     """Ten updates on latents and one end to end; and seconds to encode every frame, from a part of them."""
     spec = DataSpec({"pixels": ArraySpec((9, *store.observations["pixels"].shape[1:]))}, store.actions_spec, 3, 15)
     encoder = ConvolutionalEncoder(spec, features=FEATURES, strides=strides)
-    bottleneck = RepDIB(FEATURES, groups=16, codes=512, start_step=0).eval()
+    bottleneck = RepDIB(FEATURES, groups=16, codes=512, start_step=0)
+    bottleneck(torch.randn(1024, FEATURES))  # in training mode: the codebooks start
+    bottleneck.eval()
     frozen = FrozenEncoder(encoder, bottleneck, {})
     some = np.arange(512)
     part = seconds(lambda: encode_rows(frozen, store, some, progress=False)) / len(some)
