@@ -116,7 +116,8 @@ class Attempt:
             return [*words, "--trainer.enable_progress_bar", "false"]
         if phase == "export":
             return [run]
-        chosen = [word for key, value in self.point.suite.probe.items() for word in (f"--{key}", str(value))]
+        asked = self.point.suite.probe_of(self.point.setting)
+        chosen = [word for key, value in asked.items() for word in (f"--{key}", str(value))]
         kept = ["--output", f"{run}/{PROBE_FILE}", "--samples", f"{run}/{SAMPLES_FILE}"]
         return [run, str(self.point.setting.data), *kept, *chosen]
 

@@ -107,6 +107,7 @@ class Grid:
         data: the store that its settings are trained and probed on.
         collect: words of a ``collect`` command that makes the store where it is absent; empty for none.
         seeds: of the suite's reported seeds, those that its settings are run with; empty for all.
+        probe: options of ``probe`` in place of the suite's; None for those.
     """
 
     name: str
@@ -116,6 +117,7 @@ class Grid:
     data: Path
     collect: tuple[str, ...]
     seeds: tuple[int, ...] = ()
+    probe: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -213,6 +215,11 @@ class Suite:
         for setting in itertools.chain.from_iterable(grid.settings for grid in self.grids):
             kept.setdefault(identity(setting), setting)
         return kept
+
+    def probe_of(self, setting: Setting) -> Mapping[str, Any]:
+        """Further options of ``probe`` for a setting."""
+        own = self.grid(setting.grid).probe
+        return self.probe if own is None else own
 
     def has(self, setting: Setting, seed: int) -> bool:
         """Whether a setting is run with a seed: one that a grid of it has, or one that the suite does not name."""

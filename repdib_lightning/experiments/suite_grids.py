@@ -15,7 +15,7 @@ import yaml
 from repdib_lightning import configurations
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.experiments.merging import merged, with_option
-from repdib_lightning.experiments.suite import CONFIG, SET_BY_SUITE, Finetune, Grid, Setting, check_seeds
+from repdib_lightning.experiments.suite import CONFIG, PROBE_OPTIONS, SET_BY_SUITE, Finetune, Grid, Setting, check_seeds
 from repdib_lightning.experiments.suite_checks import check_choice, check_keys, check_name, listed, mapping
 from repdib_lightning.rl import AGENTS
 
@@ -44,7 +44,7 @@ def read_grid(file: Path, name: str, content: Any, common: Common) -> Grid:
     """One grid. Raises UserError naming the file and the key."""
     key = f"grids.{name}"
     check_name(file, key, name)
-    known = {"about", "baseline", "with", "vary", "settings", "data", "collect", "finetune", "seeds"}
+    known = {"about", "baseline", "with", "vary", "settings", "data", "collect", "finetune", "seeds", "probe"}
     check_keys(file, key, content, known)
     own = _own(file, key, content, common)
     finetune = read_finetune(file, f"{key}.finetune" if content.get("finetune") else "finetune", own.finetune)
@@ -70,7 +70,9 @@ def read_grid(file: Path, name: str, content: Any, common: Common) -> Grid:
     if baseline not in names:
         raise UserError(f"{file}: {key}.baseline: no setting is called '{baseline}', {nearest(baseline, names)}")
     seeds = read_seeds(file, f"{key}.seeds", content["seeds"]) if "seeds" in content else ()
-    return Grid(name, str(content.get("about", "")), baseline, tuple(settings), own.data, own.collect, seeds)
+    about = str(content.get("about", ""))
+    probe = check_keys(file, f"{key}.probe", content["probe"], set(PROBE_OPTIONS)) if "probe" in content else None
+    return Grid(name, about, baseline, tuple(settings), own.data, own.collect, seeds, probe)
 
 
 def read_store(file: Path, key: str, given: Any) -> Path:

@@ -32,25 +32,30 @@ def check_measures(suite: Suite) -> None:
         _check(suite, f"headline.{row.label}.measure", f"{row.measure}/kept", suite.grids[:1])
 
 
-def probes_of(suite: Suite) -> tuple[str, ...]:
-    """Names of the probes that every pre-trained point is read by."""
-    return words(suite.probe.get("probes", FACTOR_PROBES), f"{suite.file}: probe.probes")
+def probes_of(suite: Suite, grid: Grid) -> tuple[str, ...]:
+    """Names of the probes that every pre-trained point of a grid is read by."""
+    own = suite.probe if grid.probe is None else grid.probe
+    return words(own.get("probes", FACTOR_PROBES), f"{suite.file}: probe.probes")
 
 
 def _check_probes(suite: Suite) -> None:
-    chosen, known = probes_of(suite), (*FACTOR_PROBES, PICTURE_PROBE)
-    for name in chosen:
-        if name not in known:
-            raise UserError(f"{suite.file}: probe.probes: '{name}' is not known, {nearest(name, known)}")
-    if not set(chosen) & set(FACTOR_PROBES):
-        raise UserError(f"{suite.file}: probe.probes: one of {', '.join(FACTOR_PROBES)} is needed")
+    known = (*FACTOR_PROBES, PICTURE_PROBE)
+    for grid in suite.grids:
+        chosen = probes_of(suite, grid)
+        where = f"{suite.file}: " + ("probe.probes" if grid.probe is None else f"grids.{grid.name}.probe.probes")
+        for name in chosen:
+            if name not in known:
+                raise UserError(f"{where}: '{name}' is not known, {nearest(name, known)}")
+        if not set(chosen) & set(FACTOR_PROBES):
+            raise UserError(f"{where}: one of {', '.join(FACTOR_PROBES)} is needed")
 
 
 def _check(suite: Suite, key: str, measure: str, grids: Sequence[Grid]) -> None:
     first, _, rest = str(measure).partition("/")
     settings = [setting for grid in grids for setting in grid.settings]
     finetunes = [setting.finetune for setting in settings if setting.finetune is not None]
-    probed = (*probes_of(suite), "codes", "val") if any(setting.pretrained for setting in settings) else ()
+    probes = [name for grid in grids for name in probes_of(suite, grid)]
+    probed = (*probes, "codes", "val") if any(setting.pretrained for setting in settings) else ()
     known = {*probed, *(finetune.agent for finetune in finetunes)}
     where = f"{suite.file}: {key}: '{measure}'"
     if first not in known:

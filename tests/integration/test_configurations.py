@@ -17,6 +17,7 @@ from killing import command_in_processes
 
 from repdib_lightning.__main__ import VERBS, main
 from repdib_lightning.configurations import packaged, packaged_suites
+from repdib_lightning.environments.collect_control import collect_control
 from repdib_lightning.environments.collect_maze import collect_maze
 from repdib_lightning.environments.collect_robot_arm import collect_robot_arm
 from repdib_lightning.experiments.suite_file import read_suite
@@ -41,33 +42,53 @@ def maze_recording(tmp_path_factory):
     return collect_maze(path, samples=240, episode_length=24, progress=False)
 
 
+@pytest.fixture(scope="session")
+def control_recording(tmp_path_factory):
+    """A short recording of the walker at the real size, with few actions an episode."""
+    path = tmp_path_factory.mktemp("control") / "walker.h5"
+    chosen = {"behaviour": "random", "distractors": "video", "action_repeat": 25}
+    return collect_control(path, samples=200, workers=1, progress=False, **chosen)
+
+
 @pytest.fixture
-def here(tmp_path, monkeypatch, recording, maze_recording):
+def here(tmp_path, monkeypatch, recording, maze_recording, control_recording):
     monkeypatch.chdir(tmp_path)
     Path("data").mkdir()
+    for name in ("walker_walk_video", "walker_walk_demo", "vd4rl_walker_walk_video"):
+        shutil.copy(control_recording, f"data/{name}.h5")
     shutil.copy(maze_recording, "data/gridworld.h5")
     shutil.copy(recording, "data/robot_arm.h5")
     shutil.copy(recording, "data/robot_arm_demo.h5")
     return tmp_path
 
 
-BASES = ("robot_arm", "mazes")
+PAPER = "paper/vd4rl/multi_step_inverse"
+BASES = ("robot_arm", "mazes", "control", PAPER)
 """Configurations of a whole run; the others are laid over one of them."""
 
+OVERLAYS = [name for name in packaged() if name not in BASES]
+ANYWHERE = [name for name in OVERLAYS if name.startswith(("bottleneck/", "objective/"))]
 LAYERS = [
     *([base] for base in BASES),
-    *(["robot_arm", name] for name in packaged() if name not in BASES),
-    *(["mazes", name] for name in packaged() if name.startswith(("bottleneck/", "objective/"))),
+    *(["robot_arm", name] for name in [*ANYWHERE, "debug", "demo"]),
+    *(["mazes", name] for name in ANYWHERE),
+    *(["control", name] for name in [*ANYWHERE, "demo_control"]),
+    *([PAPER, name] for name in OVERLAYS if name.startswith("paper/vd4rl/")),
 ]
+ON_A_CPU = ["--trainer.accelerator", "cpu", "--trainer.precision", "32-true"]
 
 
 @pytest.mark.parametrize("layers", LAYERS, ids="+".join)
 def test_every_configuration_trains(here, layers):
     configurations = [argument for name in layers for argument in ("--config", name)]
-    assert main(["fit", *configurations, *SMALL, "--run", "runs/x"]) == 0
+    assert main(["fit", *configurations, *SMALL, *ON_A_CPU, "--run", "runs/x"]) == 0
     assert Path("runs/x/checkpoints/step-00000003.ckpt").is_file()
     written = {path.name for path in Path("runs/x").iterdir()}
     assert {"config.yaml", "status.json", "metrics.csv", "environment.json", "bundle.json"} <= written
+
+
+def test_every_configuration_is_in_a_test():
+    assert {name for layers in LAYERS for name in layers} == set(packaged())
 
 
 def test_a_missing_recording_is_collected_first(here, recording, monkeypatch):
@@ -77,7 +98,7 @@ def test_a_missing_recording_is_collected_first(here, recording, monkeypatch):
         asked.update(options)
         shutil.copy(recording, path)
 
-    monkeypatch.setattr("repdib_lightning.environments.collect.collect_robot_arm", collect)
+    monkeypatch.setattr("repdib_lightning.environments.collect_robot_arm.collect_robot_arm", collect)
     Path("data/robot_arm.h5").unlink()
     assert main(["fit", *SMALL, "--run", "runs/x"]) == 0
     assert asked == {"samples": 14_000, "seed": 0}
@@ -135,8 +156,12 @@ def test_every_command_of_the_readme(here, monkeypatch):
         small: list[str] = []
         if command[0] == "suite":
             continue  # test_the_suite_of_the_readme, on fewer points
-        if command[0] == "finetune":
+        if command[:2] == ["finetune", "dqn"]:
             small = ["--steps", "60", "--learning_starts", "30", "--evaluate_every", "30"]
+        elif command[0] == "finetune":
+            small = ["--steps", "10", "--hidden", "32", "--batch_size", "16", "--episodes", "2"]
+        if command[:2] == ["collect", "control"]:
+            small = ["--samples", "500", "--workers", "1"]
         if command[0] == "fit":
             small = SMALL if "--resume" not in command else ["--trainer.max_steps", "4"]
             if "bottleneck/none" not in command and "--resume" not in command:
@@ -163,6 +188,7 @@ def test_the_suite_of_the_readme(here, capsys):
     commands = suite_commands("robot_arm")
     plan = yaml.safe_load(packaged_suites()["robot_arm"].read_text())
     steps = {"config": "steps.yaml", "trainer.max_steps": 3, "trainer.val_check_interval": 2}
+    steps["trainer.log_every_n_steps"] = 1
     plan["grids"] = {"bottleneck": {"with": steps, "vary": {"config": ["bottleneck/none", "bottleneck/repdib"]}}}
     at_once = {"class_path": "RepDIB", "init_args": {"start_step": 1}}
     Path("steps.yaml").write_text(yaml.safe_dump({"data": {"batch_size": 8}, "model": {"bottleneck": at_once}}))
@@ -194,7 +220,7 @@ def test_the_suite_of_the_mazes(here, capsys):
         yaml.safe_dump(
             {
                 "data": {"batch_size": 8},
-                "trainer": {"max_steps": 3, "val_check_interval": 2},
+                "trainer": {"max_steps": 3, "val_check_interval": 2, "log_every_n_steps": 1},
                 "model": {"bottleneck": {"class_path": "RepDIB", "init_args": {"start_step": 1, "groups": 16}}},
             }
         )
@@ -216,9 +242,27 @@ def test_the_suite_of_the_mazes(here, capsys):
     assert {"report.md", "report.html", "maps.json", "curves.csv", *figures} <= written
 
 
+def test_the_suite_of_offline_control(here, capsys):
+    """The packaged suite, cut down to one point of few steps."""
+    plan = yaml.safe_load(packaged_suites()["control"].read_text())
+    plan["finetune"]["with"] = {"steps": 10, "hidden": 32, "batch_size": 16, "episodes": 2, "film": 1}
+    steps = {"trainer.max_steps": 3, "trainer.val_check_interval": 2, "data.batch_size": 8}
+    at_once = {"model.bottleneck.init_args.start_step": 1, "trainer.log_every_n_steps": 1}
+    plan["grids"] = {"headline": {"settings": {"repdib": {**steps, **at_once}}}}
+    plan |= {"seeds": [0], "claims": {}, "films": ["headline/repdib"], "show": ["repdib"]}
+    Path("control.yaml").write_text(yaml.safe_dump(plan))
+    for command in suite_commands("control"):
+        assert main([*command[:2], "control.yaml"]) == 0
+        assert "1 finished of 1" in capsys.readouterr().out or command[1] == "report"
+    written = {path.name for path in Path("results/control").iterdir()}
+    figures = {"films.png", "film-headline-repdib-walker_walk.mp4", "drawn.png", "headline-learning-eval-return.png"}
+    assert {"report.md", "report.html", "curves.csv", *figures} <= written
+
+
 @pytest.mark.parametrize("name", packaged_suites())
 def test_every_setting_of_every_suite_is_an_option_of_fit(here, name, capsys):
-    for setting in read_suite(name).settings:
+    alike = {(s.configs, tuple(s.options)): s for s in read_suite(name).settings if s.pretrained}
+    for setting in alike.values():
         with pytest.raises(SystemExit) as ending:
             main(["fit", *setting.arguments(0), "--print_config"])
         assert ending.value.code == 0, setting.place
