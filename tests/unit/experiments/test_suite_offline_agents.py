@@ -102,3 +102,17 @@ def test_films_of_different_lengths_stand_side_by_side(tmp_path):
     (tmp_path / "film.mp4").write_bytes(b"no film")
     with pytest.raises(UserError, match=r"film\.mp4: not a readable film"):
         frames_of(tmp_path / "film.mp4", 2)
+
+
+def test_a_grid_may_be_probed_otherwise(tmp_path):
+    suite = read_suite(
+        write(tmp_path, probe={"probes": "linear"}, grids={"head": {**HEAD, "probe": {"seed": 3}}, "tail": TAIL})
+    )
+    asked = {setting.place: suite.probe_of(setting) for setting in suite.settings}
+    assert asked == {"head/none": {"seed": 3}, "head/scratch": {"seed": 3}, "tail/vq": {"probes": "linear"}}
+    for probe, said in (
+        ({"probe": "mlp"}, "unknown key 'grids.tail.probe.probe'"),
+        ({"probes": "liner"}, "'liner' is not known"),
+    ):
+        with pytest.raises(UserError, match=said):
+            read_suite(write(tmp_path, grids={"tail": {**TAIL, "probe": probe}}))
