@@ -38,7 +38,7 @@ def seed_points(results: Results, grid: Grid, measures: Sequence[str]) -> bytes 
         for place, setting in enumerate(grid.settings):
             values = np.array(list(results.values(setting, measure).values()))
             if len(values):
-                _draw_seeds(panel, place, values, COLOURS[place % len(COLOURS)])
+                draw_seeds(panel, place, values, COLOURS[place % len(COLOURS)])
         hint = HINTS[direction(measure, results.factors)]
         panel.set_title(measure + (f"\n{hint.strip()}" if len(measure + hint) > WIDEST_TITLE else hint), fontsize=9)
         panel.set_xticks(range(len(grid.settings)), [setting.name for setting in grid.settings], fontsize=8)
@@ -52,7 +52,9 @@ def seed_points(results: Results, grid: Grid, measures: Sequence[str]) -> bytes 
     return png(figure)
 
 
-def _draw_seeds(panel: Axes, place: int, values: np.ndarray, colour: str) -> None:
+def draw_seeds(panel: Axes, place: int, numbers: Sequence[float] | np.ndarray, colour: str) -> None:
+    """Every seed's number a dot, the mean a bar across them with its 95 % interval."""
+    values = np.asarray(numbers)
     spread = np.linspace(-0.12, 0.12, len(values)) if len(values) > 1 else np.zeros(1)
     panel.plot(place + spread, values, "o", color=colour, markersize=4.5, alpha=0.75)
     estimate = statistics.mean(values)

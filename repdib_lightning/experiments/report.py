@@ -21,6 +21,7 @@ from repdib_lightning.experiments.film_part import film_parts
 from repdib_lightning.experiments.finetune_parts import finetune_parts, training_only
 from repdib_lightning.experiments.headline import headline, verdicts
 from repdib_lightning.experiments.maze_maps import Maps, mean_maps, write_maps
+from repdib_lightning.experiments.overview import overview_parts
 from repdib_lightning.experiments.page import Part, as_markdown, as_section, facts_of
 from repdib_lightning.experiments.points import PROBE_FILE, SAMPLES_FILE
 from repdib_lightning.experiments.results import Results, load_results
@@ -59,14 +60,14 @@ def report_suite(
     all_maps = {grid.name: mean_maps(results, grid) for grid in plan.grids}
     found = {grid.name: (summaries(results, grid), differences(results, grid)) for grid in plan.grids}
     parts = [*_headline_part(results), *_grid_parts(results, found, all_bands, all_maps), *_latent_parts(results)]
-    parts += film_parts(results)
+    parts = [*overview_parts(results), *parts, *film_parts(results)]
     _write(folder, results, parts, all_bands)
     if any(all_maps.values()):
         write_maps(folder / "maps.json", all_maps)
     tables.write_summaries(folder / "summary.csv", [row for rows, _ in found.values() for row in rows])
     tables.write_differences(folder / "differences.csv", [row for _, rows in found.values() for row in rows])
     missing = f"    {len(results.missing)} not finished: {', '.join(results.missing[:4])}" if results.missing else ""
-    shown = "\n\n".join(table.text() for table in parts[0].tables)
+    shown = "\n\n".join(table.text() for table in next(part.tables for part in parts if part.tables))
     return f"{shown}\n\nwrote {folder}/report.md, report.html and the rest, of {len(results.records)} points{missing}"
 
 

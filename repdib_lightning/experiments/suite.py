@@ -176,6 +176,7 @@ class Suite:
         curves: columns of metrics.csv to draw. finetune_curves: columns of the fine-tunings' progress.csv to draw.
         show: settings of the first grid whose latents and drawn pictures are shown. colours: factors that colour them.
         maps: settings whose maps of mazes are shown; empty for all.
+        overview: measures that the report draws over all grids, first of all.
         films: places (``grid/setting``) of the settings whose policies are shown in films.
     """
 
@@ -199,6 +200,7 @@ class Suite:
     finetune_curves: tuple[str, ...] = ("eval/success",)
     maps: tuple[str, ...] = ()
     films: tuple[str, ...] = ()
+    overview: tuple[str, ...] = ()
 
     def grid(self, name: str) -> Grid:
         """The grid of this name; the first one for an empty name."""

@@ -76,6 +76,7 @@ def read_suite(name: str | Path) -> Suite:
         headline=tuple(_headline_row(file, *item, known) for item in mapping(file, "headline", headline).items()),
         claims=tuple(_claim(file, *item, built) for item in mapping(file, "claims", tree.get("claims")).items()),
         measures=words(file, "measures", tree.get("measures", [])),
+        overview=words(file, "overview", tree.get("overview", [])),
         curves=words(file, "curves", tree.get("curves", ["train/loss"])),
         show=_show(file, words(file, "show", tree.get("show", []), known), built[0]),
         colours=words(file, "colours", tree.get("colours", [])),

@@ -26,6 +26,8 @@ def check_measures(suite: Suite) -> None:
     _check_probes(suite)
     for measure in suite.measures:
         _check(suite, "measures", measure, suite.grids)
+    for measure in suite.overview:
+        _check(suite, "overview", measure, suite.grids)
     for claim in suite.claims:
         _check(suite, f"claims.{claim.text}.measure", claim.measure, [suite.grid(claim.grid)])
     for row in suite.headline:

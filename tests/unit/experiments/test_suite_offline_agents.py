@@ -94,6 +94,20 @@ def test_the_report_holds_the_films_of_the_settings_that_are_named(tmp_path):
         read_suite(write(tmp_path, films=["head/vq"]))
 
 
+def test_an_overview_draws_a_measure_over_all_grids_that_have_it(tmp_path):
+    path = write(tmp_path, finetune=None, overview=["linear/cell/kept", "val/raw/inverse"], grids={"tail": TAIL})
+    suite, runs = read_suite(path), tmp_path / "runs"
+    finish(suite, runs, typical)
+    said = report_suite(path, output=tmp_path / "out", runs=runs)
+    assert "linear" in said, "the terminal shows the first tables"
+    page = (tmp_path / "out/report.md").read_text()
+    assert page.index("## Overview") < page.index("## Grid: tail")
+    for name in ("overview-linear-cell-kept", "overview-val-raw-inverse"):
+        assert f"![{name}]({name}.png)" in page and (tmp_path / "out" / f"{name}.png").stat().st_size > 1000
+    with pytest.raises(UserError, match="overview: no point has 'linear/cel/kept', did you mean 'linear/cell/kept'"):
+        report_suite(write(tmp_path, finetune=None, overview=["linear/cel/kept"], grids={"tail": TAIL}), runs=runs)
+
+
 def test_films_of_different_lengths_stand_side_by_side(tmp_path):
     short, long = np.full((2, 4, 4, 3), 10, np.uint8), np.full((3, 4, 6, 3), 200, np.uint8)
     both = side_by_side([short, long])
