@@ -17,6 +17,7 @@ VERBS = {
     "import": ("repdib_lightning.verbs:import_data", "convert a data set: import vd4rl FOLDER data/walker.h5"),
     "inspect": ("repdib_lightning.verbs:inspect", "what is in a data file, what is wrong with it, a contact sheet"),
     "export": ("repdib_lightning.verbs:export", "make a frozen encoder bundle of a run: export runs/x"),
+    "encode": ("repdib_lightning.verbs:encode", "a data set as vectors: encode runs/x data/x.h5 data/x_latents.h5"),
     "probe": ("repdib_lightning.verbs:probe", "what a bundle kept and dropped: probe runs/x/bundle data/x.h5"),
     "compare": ("repdib_lightning.verbs:compare", "probe several bundles side by side into one HTML report"),
     "finetune": ("repdib_lightning.verbs:finetune", "RL on a bundle: finetune dqn --env SpiralWorld --encoder BUNDLE"),

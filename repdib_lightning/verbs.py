@@ -62,6 +62,14 @@ def probe(arguments: list[str]) -> int:
     return 0
 
 
+def encode(arguments: list[str]) -> int:
+    """``encode BUNDLE DATA OUTPUT [options]``."""
+    from repdib_lightning.evaluation.encoded_store import encode_store
+
+    print(f"wrote {_call('encode', encode_store, arguments)}")
+    return 0
+
+
 def finetune(arguments: list[str]) -> int:
     """``finetune AGENT [options]``."""
     from repdib_lightning.rl import AGENTS
