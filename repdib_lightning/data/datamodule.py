@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 
@@ -75,10 +76,10 @@ class EpisodeDataModule(pl.LightningDataModule):
 
     def prepare_data(self) -> None:
         """Collect the file if it is absent and ``collect`` says how, and say so."""
-        if self.collect and not self.path.exists():
+        if self.collect.strip() and not self.path.exists():
             from repdib_lightning.verbs import collect
 
-            environment, *options = self.collect.split()
+            environment, *options = shlex.split(self.collect)
             print(f"{self.path}: no such file; collecting {self.collect} there", file=sys.stderr, flush=True)
             collect([environment, str(self.path), *options])
 

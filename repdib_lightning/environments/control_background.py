@@ -50,6 +50,9 @@ class Backgrounds:
             raise UserError(f"distractors={kind}: unknown, {nearest(kind, KINDS)}")
         if place not in PLACES:
             raise UserError(f"place={place}: unknown, {nearest(place, PLACES)}")
+        if kind == "none" and (source or place != PLACES[0]):
+            said = f"source={source}" if source else f"place={place}"
+            raise UserError(f"{said}: means nothing without distractors; choose distractors image or video")
         self.kind, self.place = kind, place
         self.panel = size // 2 if place == "side" and kind != "none" else 0
         self._clips = None

@@ -16,6 +16,7 @@ Training and evaluation never share a clip; which is which depends on (source, s
 from __future__ import annotations
 
 from collections import OrderedDict
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -230,7 +231,6 @@ class Cifar10:
 
     def __init__(self, root: Path) -> None:
         self._root = root
-        self._pixels: dict[str, np.ndarray] = {}
 
     def keys(self, split: Split) -> list[tuple[Split, int]]:
         """(split, number) pairs.
@@ -238,20 +238,26 @@ class Cifar10:
         Raises:
             UserError: files are missing or damaged.
         """
-        from torchvision.datasets import CIFAR10
-
-        try:
-            self._pixels[split] = CIFAR10(str(self._root), train=split == "train", download=False).data
-        except Exception as error:  # torchvision raises RuntimeError, pickle nearly anything, on damaged files
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise UserError(f"{self._root / CIFAR_FOLDER}: not torchvision's CIFAR-10 ({reason})") from error
-        return [(split, number) for number in range(len(self._pixels[split]))]
+        return [(split, number) for number in range(len(_cifar_pixels(self._root, split)))]
 
     def load(self, key: tuple[Split, int], height: int, width: int) -> np.ndarray:
         """(1, H, W, 3) uint8."""
         from PIL import Image
 
-        return _fitted(Image.fromarray(self._pixels[key[0]][key[1]]), height, width)[None]
+        return _fitted(Image.fromarray(_cifar_pixels(self._root, key[0])[key[1]]), height, width)[None]
+
+
+@lru_cache(maxsize=2)
+def _cifar_pixels(root: Path, split: Split) -> np.ndarray:
+    """(n, 32, 32, 3) uint8: a split of CIFAR-10, in memory once however many environments show it."""
+    from torchvision.datasets import CIFAR10
+
+    try:
+        pixels: np.ndarray = CIFAR10(str(root), train=split == "train", download=False).data
+    except Exception as error:  # torchvision raises RuntimeError, pickle nearly anything, on damaged files
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"{root / CIFAR_FOLDER}: not torchvision's CIFAR-10 ({reason})") from error
+    return pixels
 
 
 class Folder:

@@ -51,13 +51,24 @@ def recorded_in_order(recording: Recording, episodes: Sequence[int], workers: in
         for place, wanted in enumerate(episodes):
             while wanted not in waiting:
                 while idle and given < min(len(episodes), place + 2 * workers):
-                    idle.pop().send(episodes[given])
+                    _send(idle.pop(), episodes[given])
                     given += 1
                 for connection in wait([c for c in connections if c not in idle]):
                     episode, result = _receive(connection)
                     waiting[episode] = result
                     idle.append(connection)
             yield waiting.pop(wanted)
+
+
+def _send(connection: Any, episode: int) -> None:
+    try:
+        connection.send(episode)
+    except OSError as error:
+        raise _died() from error
+
+
+def _died() -> UserError:
+    return UserError("a rendering process died (out of memory, or a fault of the graphics driver); try --workers 1")
 
 
 def _serve(connection: Connection, recording: Recording) -> None:
@@ -80,7 +91,7 @@ def _receive(connection: Any) -> tuple[int, dict[str, Any]]:
     try:
         episode, result = connection.recv()
     except EOFError as error:
-        raise RuntimeError("a rendering process died (out of memory, or a fault of the graphics driver)") from error
+        raise _died() from error
     if isinstance(result, Exception):
         raise result
     return episode, result

@@ -90,7 +90,7 @@ def train_policies(
         "algorithm": "SAC (Stable-Baselines3)",
         "command": f"collect policies {path.name} --task {environment.task.name} --steps {steps} --action_repeat "
         f"{action_repeat} --hidden {hidden} --learning_rate {learning_rate} --seed {seed} --evaluate_every "
-        f"{evaluate_every}",
+        f"{evaluate_every} --threads {threads}",
         "networks": {name: {"steps": kept[i][0], "return": round(kept[i][1], 1)} for name, i in chosen.items()},
     }
     write_policies(path, facts, {name: kept[i][2] for name, i in chosen.items()})

@@ -10,12 +10,16 @@ import numpy as np
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.outputs import check_output_file
 from repdib_lightning.data.writer import EpisodeWriter
+from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation.bundles import bundle_of
 from repdib_lightning.evaluation.features import check_compatible, encode_rows, resolve_device
 from repdib_lightning.records import ArraySpec
 
 LATENT, CODES = "latent", "codes"
 """Names of the observations."""
+
+_TOLD = ("environment", "configuration", "seed", "licence")
+_ENDS = ("rewards", "terminations", "truncations")
 
 
 def encode_store(
@@ -45,7 +49,8 @@ def encode_store(
         The path of the new store.
 
     Raises:
-        UserError: bad bundle or data, observations that do not match, an output that exists or cannot be written.
+        UserError: bad bundle or data, observations that do not match, rewards without ends of episodes, an output that
+            exists or cannot be written.
     """
     from tqdm import tqdm
 
@@ -59,7 +64,10 @@ def encode_store(
     observations = {LATENT: ArraySpec((encoder.features,), "float32")}
     if encoder.groups:
         observations[CODES] = ArraySpec((encoder.groups,), "float32")
-    kept = [name for name in ("rewards", "terminations", "truncations") if name in store]
+    kept = [name for name in _ENDS if name in store]
+    if kept and len(kept) < len(_ENDS):
+        missing = next(name for name in _ENDS if name not in store)
+        raise UserError(f"{data}: has '{kept[0]}' but no '{missing}'; a store has all of {', '.join(_ENDS)}, or none")
     writer = EpisodeWriter(
         output,
         rows=store.rows,
@@ -67,9 +75,9 @@ def encode_store(
         observations=observations,
         actions=store.actions_spec,
         factors=store.factors,
-        rewards=len(kept) == 3,
+        rewards=bool(kept),
         attributes={
-            **{name: store.attributes[name] for name in ("environment", "licence") if name in store.attributes},
+            **{name: store.attributes[name] for name in _TOLD if name in store.attributes},
             "encoded": {"data": store.path.name, "fingerprint": store.fingerprint, "encoder": encoder.description},
         },
         overwrite=overwrite,
@@ -90,7 +98,5 @@ def _rest(store: EpisodeStore, rows: np.ndarray) -> dict[str, Any]:
     found: dict[str, Any] = {"factors": {name: store.gather(f"factors/{name}", rows) for name in store.factors}}
     if store.actions_spec is not None:
         found["actions"] = store.gather("actions", rows[:-1])
-    if all(name in store for name in ("rewards", "terminations", "truncations")):
-        for name in ("rewards", "terminations", "truncations"):
-            found[name] = store.gather(name, rows[:-1])
+    found |= {name: store.gather(name, rows[:-1]) for name in _ENDS if name in store}
     return found

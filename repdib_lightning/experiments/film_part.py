@@ -12,22 +12,22 @@ from repdib_lightning.evaluation.figures import png
 from repdib_lightning.experiments.page import Part
 from repdib_lightning.experiments.points import Point
 from repdib_lightning.experiments.results import Results
-
-FILM = "evaluation.mp4"
-"""What an offline agent films, in the folder of its fine-tuning."""
+from repdib_lightning.rl.options import FILM
 
 _SHOWN = 8
 
 
 def film_parts(results: Results) -> list[Part]:
     """One part with the films of the settings that the suite names, of each one's first finished seed."""
+    suite = results.suite
+    named = [setting for grid in suite.grids for setting in grid.settings if setting.place in suite.films]
+    wanted = {suite.run_by(setting).place for setting in named}
     films: dict[str, bytes] = {}
     strips: dict[str, np.ndarray] = {}
-    for grid in results.suite.grids:
+    for grid in suite.grids:
         for setting in grid.settings:
-            place = results.suite.run_by(setting).place
             point = next((p for seed in results.seeds if (p := results.point(setting, seed))), None)
-            if point is None or place not in results.suite.films or place != setting.place:
+            if point is None or setting.place not in wanted:
                 continue
             for run, path in _films_of(point).items():
                 name = f"film-{grid.name}-{setting.name}-{run}"

@@ -16,6 +16,9 @@ from repdib_lightning.experiments.suite import Claim, Grid, HeadlineRow
 READINGS = {"error": "error of predicting it", "kept": "how much of it is kept"}
 """Last part of a measure -> what a relative "error" can mean."""
 
+FEWEST_SEEDS = 5
+"""Below, a bootstrap interval is little more than the range of the seeds, and no claim is judged by it."""
+
 TIE = 0.01
 """Relative values of the paper that differ by less than this are taken as equal when orders are compared."""
 
@@ -75,11 +78,12 @@ def _agrees(row: HeadlineRow, cells: dict[str, HeadlineCell]) -> bool | None:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim, the number that it is about, and whether it holds (None: no interval, or nothing to divide by)."""
+    """A claim, the number that it is about, whether it holds (None: it cannot be told), and by how many seeds."""
 
     claim: Claim
     estimate: Estimate | None
     holds: bool | None
+    seeds: int
 
 
 def verdicts(results: Results) -> list[Verdict]:
@@ -92,11 +96,13 @@ def _verdict(results: Results, grid: Grid, claim: Claim) -> Verdict:
     by_name = {setting.name: setting for setting in grid.settings}
     ours, theirs = results.paired(by_name[claim.setting], by_name[claim.than or grid.baseline], claim.measure)
     if not len(ours):
-        return Verdict(claim, None, None)
+        return Verdict(claim, None, None, 0)
     estimate = _estimate(claim, ours, theirs)
     if estimate is None:
-        return Verdict(claim, None, None)
-    return Verdict(claim, estimate, _holds(claim, estimate))
+        return Verdict(claim, None, None, len(ours))
+    if claim.judge == "interval" and len(ours) < FEWEST_SEEDS:
+        return Verdict(claim, estimate, None, len(ours))
+    return Verdict(claim, estimate, _holds(claim, estimate), len(ours))
 
 
 def _holds(claim: Claim, estimate: Estimate) -> bool | None:

@@ -19,14 +19,14 @@ def overview_parts(results: Results) -> list[Part]:
     """One part with a figure a measure that the suite names; none without.
 
     Raises:
-        UserError: a measure that no point has.
+        UserError: a measure that no point has, once all are finished.
     """
     suite = results.suite
     anywhere = dict.fromkeys(name for grid in suite.grids for name in results.measures(grid))
     for measure in suite.overview:
-        if measure not in anywhere:
+        if measure not in anywhere and not results.missing:
             raise UserError(f"{suite.file}: overview: no point has '{measure}', {nearest(measure, anywhere)}")
-    drawn = {f"overview-{m.replace('/', '-')}": overview_figure(results, m) for m in suite.overview}
+    drawn = {f"overview-{m.replace('/', '-')}": overview_figure(results, m) for m in suite.overview if m in anywhere}
     sentence = "Every grid with the same axis: each dot is a seed, the bar the mean with its 95 % interval."
     return [Part("Overview", [sentence], [], drawn)] if drawn else []
 

@@ -34,9 +34,10 @@ class Results:
         return self.points.get((self.suite.run_by(setting).place, seed))
 
     def values(self, setting: Setting, measure: str) -> dict[int, float]:
-        """Seed -> number, for the finished points that have this measure."""
+        """Seed -> number, for the finished points that have this measure; of the seeds of the setting's grid."""
         place = self.suite.run_by(setting).place
-        found = {seed: self.records[place, seed] for seed in self.seeds if (place, seed) in self.records}
+        wanted = [seed for seed in self.seeds if self.suite.grid(setting.grid).has_seed(seed, self.suite.seeds)]
+        found = {seed: self.records[place, seed] for seed in wanted if (place, seed) in self.records}
         return {seed: record.metrics[measure] for seed, record in found.items() if measure in record.metrics}
 
     def paired(self, ours: Setting, baseline: Setting, measure: str) -> tuple[np.ndarray, np.ndarray]:

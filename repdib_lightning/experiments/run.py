@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import json
 import signal
 import sys
 import time
@@ -72,6 +74,7 @@ def run_suite(
     todo = [p for p, state in stands if state in unfinished or (state == "finished" and p.name in redone)]
     check_finetunings(plan, todo)
     prepare_data(plan, todo)
+    check_finetunings(plan, [point for point in todo if point.setting.data is not None])  # more is known with the data
     for point in todo:
         if point.name in redone:
             forget(point, redo)
@@ -173,7 +176,26 @@ def prepare_data(plan: Suite, points: Sequence[Point]) -> None:
             from repdib_lightning.verbs import collect
 
             collect([commands[store][0], str(store), *commands[store][1:]])
-        EpisodeStore(store)
+        check_recorded_as(EpisodeStore(store), commands[store], plan.file)
+
+
+def check_recorded_as(store: EpisodeStore, words: Sequence[str], suite: Path) -> None:
+    """Check that a store was recorded by a ``collect`` command, as far as it tells.
+
+    Args:
+        store: what is there. words: of the command, environment first. suite: file that has the command.
+
+    Raises:
+        UserError: naming the store and the option that differs.
+    """
+    recorded = json.loads(store.attributes.get("configuration", "{}"))
+    for option, value in itertools.pairwise(words):
+        name = option.removeprefix("--")
+        if option.startswith("--") and name in recorded and str(recorded[name]) != value:
+            raise UserError(
+                f"{store.path}: was recorded with {name} {recorded[name]}, {suite} collects it with {value}; remove "
+                "the file, or name another one"
+            )
 
 
 def summary(points: Sequence[Point]) -> str:

@@ -119,6 +119,10 @@ class Grid:
     seeds: tuple[int, ...] = ()
     probe: Mapping[str, Any] | None = None
 
+    def has_seed(self, seed: int, reported: Sequence[int]) -> bool:
+        """Whether its settings are run with a seed: one of its own, or one that the suite does not report."""
+        return not self.seeds or seed in self.seeds or seed not in reported
+
 
 @dataclass(frozen=True)
 class HeadlineRow:
@@ -224,12 +228,10 @@ class Suite:
         return self.probe if own is None else own
 
     def has(self, setting: Setting, seed: int) -> bool:
-        """Whether a setting is run with a seed: one that a grid of it has, or one that the suite does not name."""
-        if seed not in self.seeds:
-            return True
+        """Whether a setting is run with a seed: whether one of the grids that it is in has it."""
         same = identity(setting)
         grids = [grid for grid in self.grids if any(identity(other) == same for other in grid.settings)]
-        return any(not grid.seeds or seed in grid.seeds for grid in grids)
+        return any(grid.has_seed(seed, self.seeds) for grid in grids)
 
     def run_by(self, setting: Setting) -> Setting:
         """The setting whose runs this one shares (mostly itself)."""

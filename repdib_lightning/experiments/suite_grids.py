@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import itertools
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -86,7 +87,7 @@ def read_collect(file: Path, key: str, given: Any) -> tuple[str, ...]:
     """Words of a ``collect`` command."""
     if given is not None and not isinstance(given, str):
         raise UserError(f"{file}: {key} must be words of a collect command, such as robot_arm, is {given!r:.60}")
-    return tuple((given or "").split())
+    return tuple(shlex.split(given or ""))
 
 
 def read_seeds(file: Path, key: str, given: Any) -> tuple[int, ...]:

@@ -24,6 +24,7 @@ def check_measures(suite: Suite) -> None:
         UserError: naming file, key and the nearest name.
     """
     _check_probes(suite)
+    _check_shared_probes(suite)
     for measure in suite.measures:
         _check(suite, "measures", measure, suite.grids)
     for measure in suite.overview:
@@ -50,6 +51,19 @@ def _check_probes(suite: Suite) -> None:
                 raise UserError(f"{where}: '{name}' is not known, {nearest(name, known)}")
         if not set(chosen) & set(FACTOR_PROBES):
             raise UserError(f"{where}: one of {', '.join(FACTOR_PROBES)} is needed")
+
+
+def _check_shared_probes(suite: Suite) -> None:
+    """A run that several grids share is probed as the first of them says."""
+    for grid in suite.grids:
+        for setting in grid.settings:
+            first = suite.grid(suite.run_by(setting).grid)
+            missing = [name for name in probes_of(suite, grid) if name not in probes_of(suite, first)]
+            if setting.pretrained and missing:
+                raise UserError(
+                    f"{suite.file}: grids.{grid.name}: '{setting.name}' is run once, for grid '{first.name}', whose "
+                    f"probes lack '{missing[0]}'; add it there"
+                )
 
 
 def _check(suite: Suite, key: str, measure: str, grids: Sequence[Grid]) -> None:

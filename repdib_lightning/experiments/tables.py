@@ -9,7 +9,7 @@ from pathlib import Path
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.evaluation.tables import Table, number
 from repdib_lightning.experiments.comparison import Difference, Summary, direction
-from repdib_lightning.experiments.headline import READINGS, HeadlineLine, Verdict
+from repdib_lightning.experiments.headline import FEWEST_SEEDS, READINGS, HeadlineLine, Verdict
 from repdib_lightning.experiments.results import Results
 from repdib_lightning.experiments.statistics import Estimate
 from repdib_lightning.experiments.suite import Grid, Suite
@@ -121,7 +121,8 @@ def claims_table(found: Sequence[Verdict], suite: Suite) -> Table:
         grid = suite.grid(claim.grid)
         other = "" if claim.of == "value" else f" against {claim.than or grid.baseline}"
         where = "" if grid is suite.grids[0] else f" (grid {grid.name})"
-        about = f"{claim.of} of {claim.measure}, {claim.setting}{other}{where}"
+        few = f", {verdict.seeds} seeds" if 0 < verdict.seeds < FEWEST_SEEDS else ""
+        about = f"{claim.of} of {claim.measure}, {claim.setting}{other}{where}{few}"
         rows.append([claim.text, about, interval(verdict.estimate), asked, holds])
     return Table(["claim", "measured by", "found", "asked for", ""], rows)
 

@@ -33,7 +33,7 @@ def finetune_td3bc(
     noise: float = 0.2,
     noise_clip: float = 0.3,
     copies: int = 1,
-    shift: int = 4,
+    shift: int | None = None,
     features: int | None = None,
     channels: int | None = None,
     strides: list[int] | None = None,
@@ -70,7 +70,8 @@ def finetune_td3bc(
         noise: deviation of the noise on actions.
         noise_clip: where that noise is clipped.
         copies: how often each frame is encoded, randomly shifted but for the first time.
-        shift: largest random shift in pixels: of the copies, or of every picture of an encoder that is trained.
+        shift: largest random shift in pixels, of the copies, or of every picture of an encoder that is trained; 4 by
+            default.
         features: width of a trained encoder; 256 by default.
         channels: of a trained encoder's convolutions; 32 by default.
         strides: of a trained encoder's convolutions; [2, 1, 1, 1] by default.
@@ -104,7 +105,7 @@ def finetune_bc(
     batch_size: int = 256,
     hidden: int = 1024,
     copies: int = 1,
-    shift: int = 4,
+    shift: int | None = None,
     features: int | None = None,
     channels: int | None = None,
     strides: list[int] | None = None,
@@ -134,12 +135,30 @@ def finetune_bc(
 
 def check_td3bc(**given: Any) -> None:
     """What is wrong with options of ``finetune td3bc``, as far as that can be known before anything runs."""
-    check_offline_options(_options("td3bc", given))
+    _check("td3bc", given)
 
 
 def check_bc(**given: Any) -> None:
     """What is wrong with options of ``finetune bc``, as far as that can be known before anything runs."""
-    check_offline_options(_options("bc", given))
+    _check("bc", given)
+
+
+def _check(agent: str, given: Mapping[str, Any]) -> None:
+    """The options alone; and where the data are there, whether they have what is needed, and the environment opens."""
+    options = _options(agent, given)
+    check_offline_options(options)
+    if not options.data.exists():
+        return
+    from repdib_lightning.data.episodes import EpisodeStore
+    from repdib_lightning.rl.offline_environment import evaluated_environment, open_all
+    from repdib_lightning.rl.transitions import Transitions
+
+    store = EpisodeStore(options.data)
+    Transitions(store, rewarded=agent != "bc").check_batch(options.batch_size)
+    chosen = evaluated_environment(store, options.env, options.env_options or {})
+    if chosen is not None and store.actions_spec is not None:
+        for environment in open_all(*chosen, 1, store.actions_spec.size):
+            environment.close()
 
 
 def _options(agent: str, given: Mapping[str, Any]) -> OfflineOptions:

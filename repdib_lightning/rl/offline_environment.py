@@ -17,10 +17,10 @@ CONTROL = "repdib/Control-v0"
 _SHORT = "Control"
 _VD4RL = "dm_control/"
 
-_FIXED = ("task", "action_repeat", "image_size")
-"""Of a recording; evaluated otherwise, its return would be that of another problem."""
+_FIXED = ("task", "action_repeat", "image_size", "distractor_seed")
+"""Of a recording; evaluated otherwise, its return would be that of another problem, or amid clips that were seen."""
 
-_TAKEN = (*_FIXED, "quality", "distractors", "place", "source")
+_TAKEN = ("task", "action_repeat", "image_size", "quality", "distractors", "place", "source")
 
 
 def evaluated_environment(
@@ -41,19 +41,23 @@ def evaluated_environment(
         return None
     recorded = recorded_options(store)
     if env and (env not in (CONTROL, _SHORT) or recorded is None):
-        return env, dict(options)
+        held_out = {"evaluation": True} if env in (CONTROL, _SHORT) else {}
+        return env, {**held_out, **options}
     if recorded is None:
         raise UserError(
             f"{store.path}: does not tell in which environment it was recorded; name one with --env, or train without "
             "evaluation with --env none"
         )
     for name in _FIXED:
-        if name in options and _spelled(options[name]) != _spelled(recorded[name]):
+        if name in options and name in recorded and _spelled(options[name]) != _spelled(recorded[name]):
             raise UserError(
                 f"--env_options.{name} {options[name]}: {store.path} was recorded with {recorded[name]}; leave it out, "
                 "or collect other data"
             )
-    return CONTROL, {"evaluation": True, **recorded, **options}
+    chosen = {"evaluation": True, **recorded, **options}
+    if chosen.get("distractors") == "none":  # what was recorded of them means nothing then
+        chosen = {name: value for name, value in chosen.items() if name in options or name not in ("place", "source")}
+    return CONTROL, chosen
 
 
 def _spelled(option: Any) -> Any:
@@ -64,11 +68,12 @@ def _spelled(option: Any) -> Any:
 def recorded_options(store: EpisodeStore) -> dict[str, Any] | None:
     """Options of :class:`ControlEnv` that a store of the Control Suite was recorded with; None for any other."""
     environment = str(store.attributes.get("environment", ""))
-    if environment == "control":
+    if environment == "control" and "configuration" in store.attributes:
         configuration = json.loads(store.attributes["configuration"])
         found = {name: configuration[name] for name in _TAKEN}
         return {**found, "distractor_seed": configuration["seed"]}
-    if environment.startswith(_VD4RL):
+    published = str(store.attributes.get("vd4rl_set", "main/"))  # the others change the scene or the body
+    if environment.startswith(_VD4RL) and published.startswith("main/"):
         shape = next(iter(store.observations.values())).shape
         task = environment.removeprefix(_VD4RL)
         return {"task": task, "action_repeat": 2, "image_size": shape[-1], "quality": "paper"}

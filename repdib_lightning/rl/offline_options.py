@@ -16,6 +16,10 @@ FRESH = {"features": 256, "channels": 32, "strides": [2, 1, 1, 1], "frame_stack"
 """Of an encoder that is trained by the agent (DrQ-v2), unless chosen; they mean nothing beside one that is given."""
 
 
+SHIFT = 4
+"""Largest random shift in pixels, unless chosen (DrQ-v2, at 84 px)."""
+
+
 @dataclass(frozen=True)
 class OfflineOptions:
     """Described in :mod:`repdib_lightning.rl.finetune_offline`, which has the defaults. ``values`` holds what only
@@ -32,7 +36,7 @@ class OfflineOptions:
     batch_size: int
     hidden: int
     copies: int
-    shift: int
+    shift: int | None
     features: int | None
     channels: int | None
     strides: list[int] | None
@@ -44,6 +48,11 @@ class OfflineOptions:
     gamma: float = 0.99
     n_steps: int = 1
     values: Mapping[str, float] | None = None
+
+    @property
+    def pixels(self) -> int:
+        """Largest random shift."""
+        return SHIFT if self.shift is None else self.shift
 
     def fresh(self, name: str) -> Any:
         """An option of a fresh encoder."""
@@ -59,9 +68,9 @@ def check_offline_options(options: OfflineOptions) -> None:
     for name in _COUNTS:
         if getattr(options, name) < 1:
             raise UserError(f"--{name} must be at least 1, is {getattr(options, name)}")
-    for name in ("seed", "shift", "film"):
-        if not 0 <= getattr(options, name) < 2**32:
-            raise UserError(f"--{name} must be from 0 to {2**32 - 1}, is {getattr(options, name)}")
+    for name, value in (("seed", options.seed), ("shift", options.pixels), ("film", options.film)):
+        if not 0 <= value < 2**32:
+            raise UserError(f"--{name} must be from 0 to {2**32 - 1}, is {value}")
     if not 0.0 < options.learning_rate < math.inf:
         raise UserError(f"--learning_rate must be above 0 and finite, is {options.learning_rate}")
     if not 0.0 <= options.gamma <= 1.0:
@@ -83,5 +92,9 @@ def _check_encoder(options: OfflineOptions) -> None:
         values = [options.fresh(name)] if name != "strides" else options.fresh(name)
         if min(values, default=0) < 1:
             raise UserError(f"--{name} must be at least 1, is {options.fresh(name)}")
+    if options.encoder is not None and options.copies == 1 and options.shift is not None:
+        raise UserError(
+            "--shift means nothing beside --encoder with one copy of each frame; add --copies, or leave it out"
+        )
     if options.encoder is None and options.copies > 1:
         raise UserError("--copies are of frames that a given encoder encodes once; leave it out without --encoder")

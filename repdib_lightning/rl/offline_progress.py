@@ -53,6 +53,8 @@ class OfflineProgress(pl.Callback):
         if done % self.every and done != self.steps:
             return
         assert isinstance(pl_module, BehaviourCloning)
+        trained = {f"train/{name}": float(value) for name, value in pl_module.latest.items()}
+        _check_finite(trained, done)  # first: a simulator does not take actions that are no numbers
         row: dict[str, float] = {"step": done}
         if self.evaluate is not None:
             pl_module.eval()
@@ -61,10 +63,8 @@ class OfflineProgress(pl.Callback):
             reached = float(self.returns.mean())
             row |= {"eval/return": reached, "eval/normalised": reached / 10.0}
             self._bar.set_postfix_str(f"return {reached:.0f}")
-        row |= {f"train/{name}": float(value) for name, value in pl_module.latest.items()}
-        lost = [name for name, value in row.items() if not math.isfinite(value)]
-        if lost:
-            raise UserError(f"{lost[0]} is {row[lost[0]]} after {done} updates; try a smaller --learning_rate")
+        row |= trained
+        _check_finite(row, done)
         self.rows.append(row)
         if trainer.logger is not None:
             trainer.logger.log_metrics({name: value for name, value in row.items() if name != "step"}, step=done)
@@ -81,3 +81,9 @@ class OfflineProgress(pl.Callback):
     def curve(self, name: str) -> np.ndarray:
         """(n,) values of a column, in order."""
         return np.array([row[name] for row in self.rows if name in row])
+
+
+def _check_finite(row: dict[str, float], done: int) -> None:
+    for name, value in row.items():
+        if not math.isfinite(value):
+            raise UserError(f"{name} is {value} after {done} updates; try a smaller --learning_rate")

@@ -13,8 +13,10 @@ import lightning.pytorch as pl
 import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.environments import SLURMEnvironment
 
 from repdib_lightning.bottlenecks import Identity
+from repdib_lightning.callbacks import exit_codes
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.encoders import ConvolutionalEncoder
@@ -33,14 +35,12 @@ from repdib_lightning.rl.networks import ShiftedPictures, StandardisedLatents
 from repdib_lightning.rl.offline_environment import evaluated_environment, open_all
 from repdib_lightning.rl.offline_options import OfflineOptions
 from repdib_lightning.rl.offline_progress import OfflineProgress
-from repdib_lightning.rl.options import CONFIGURATION, OUTCOME, plain
+from repdib_lightning.rl.options import CONFIGURATION, FILM, OUTCOME, plain
 from repdib_lightning.rl.policy_file import save_policy
 from repdib_lightning.rl.row_sources import Latents, Pictures
 from repdib_lightning.rl.td3_bc import TD3BC, BehaviourCloning
 from repdib_lightning.rl.transitions import TransitionBatches, Transitions
 from repdib_lightning.versions import versions
-
-FILM = "evaluation.mp4"
 
 
 class OfflineTraining:
@@ -70,6 +70,7 @@ class OfflineTraining:
         else:
             self.encoder = load_encoder(bundle).to(self.device)
             check_compatible(self.encoder, self.store, str(options.encoder))
+        self.films: list[np.ndarray] = []
         self.evaluation = self._open_evaluation()
         try:
             self.source, self.agent = self._build()
@@ -85,7 +86,7 @@ class OfflineTraining:
 
     def _open_evaluation(self) -> EpisodesAtOnce | None:
         options = self.options
-        chosen = evaluated_environment(self.store, options.env, options.env_options or {})
+        self.evaluated_in = chosen = evaluated_environment(self.store, options.env, options.env_options or {})
         if chosen is None:
             return None
         assert self.store.actions_spec is not None
@@ -104,11 +105,11 @@ class OfflineTraining:
         source: Latents | Pictures
         features: StandardisedLatents | ShiftedPictures
         if isinstance(self.encoder, FrozenEncoder):
-            shifts = {"copies": options.copies, "shift": options.shift, "seed": options.seed}
+            shifts = {"copies": options.copies, "shift": options.pixels, "seed": options.seed}
             source = latents = Latents(self.store, self.encoder, **shifts, progress=sys.stderr.isatty())
             features = StandardisedLatents(latents.mean, latents.deviation)
         else:
-            source, features = Pictures(self.store, self.encoder.spec), ShiftedPictures(self.encoder, options.shift)
+            source, features = Pictures(self.store, self.encoder.spec), ShiftedPictures(self.encoder, options.pixels)
         assert self.store.actions_spec is not None
         width, actions = self.encoder.features, self.store.actions_spec.size
         sizes: dict[str, Any] = {"hidden": options.hidden, "learning_rate": options.learning_rate}
@@ -136,7 +137,7 @@ class OfflineTraining:
         batches = TransitionBatches(
             self.store, self.transitions, self.source, options.batch_size, options.steps, options.seed
         )
-        evaluate = None if self.evaluation is None else partial(self._evaluate, folder, self.evaluation)
+        evaluate = None if self.evaluation is None else partial(self._evaluate, self.evaluation)
         self.progress = OfflineProgress(folder, options.evaluate_every, options.steps, evaluate)
         trainer = pl.Trainer(
             max_epochs=1,
@@ -149,16 +150,17 @@ class OfflineTraining:
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
+            default_root_dir=folder,
+            plugins=[SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else None,
         )
-        trainer.fit(self.agent, train_dataloaders=batches)
+        with exit_codes():
+            trainer.fit(self.agent, train_dataloaders=batches)
         (folder / TensorBoardLogger.NAME_HPARAMS_FILE).unlink(missing_ok=True)  # says nothing
         self.agent.eval().to(self.device)
 
-    def _evaluate(self, folder: Path, evaluation: EpisodesAtOnce, last: bool) -> np.ndarray:
+    def _evaluate(self, evaluation: EpisodesAtOnce, last: bool) -> np.ndarray:
         """Returns (n,); the last time, some of the episodes are filmed."""
-        returns, films = evaluation.run(self.act, min(self.options.film, self.options.episodes) if last else 0)
-        if films:
-            write_film(folder / FILM, side_by_side(films))
+        returns, self.films = evaluation.run(self.act, min(self.options.film, self.options.episodes) if last else 0)
         return returns
 
     def finish(self, folder: Path) -> dict[str, Any]:
@@ -181,7 +183,8 @@ class OfflineTraining:
         measures["clone_error"] = float(self.progress.curve("train/clone")[-1])
         outcome = {
             "agent": self.options.agent,
-            "environment": self.options.env or str(self.store.attributes.get("environment", "")),
+            "environment": "none" if self.evaluated_in is None else self.evaluated_in[0],
+            "environment_options": {} if self.evaluated_in is None else self.evaluated_in[1],
             "versions": versions(),
             "configuration": plain(asdict(self.options)),
             "data": {"file": self.store.path.name, "fingerprint": self.store.fingerprint},
@@ -190,6 +193,8 @@ class OfflineTraining:
         }
         with whole_file(folder / OUTCOME) as path:
             path.write_text(json.dumps(outcome, indent=1, allow_nan=False) + "\n")
+        if self.films:  # last, so that nothing is lost where it cannot be written
+            write_film(folder / FILM, side_by_side(self.films))
         return outcome
 
     def close(self) -> None:

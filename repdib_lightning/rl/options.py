@@ -11,6 +11,8 @@ from repdib_lightning.errors import UserError
 from repdib_lightning.rl import FRESH_OPTIONS
 
 CONFIGURATION, PROGRESS, OUTCOME = "finetune.json", "progress.csv", "outcome.json"
+FILM = "evaluation.mp4"
+"""What an offline agent films."""
 
 
 @dataclass(frozen=True)

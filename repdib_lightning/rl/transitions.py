@@ -53,7 +53,7 @@ class Transitions:
         rows, later: (N,) int64, t and t + m. returns, discounts: (N,) float32.
 
     Raises:
-        UserError: no continuous actions in [-1, 1], or no rewards where they are needed.
+        UserError: no continuous actions in [-1, 1], or no finite rewards where they are needed.
     """
 
     def __init__(self, store: EpisodeStore, *, n_steps: int = 1, gamma: float = 0.99, rewarded: bool = True) -> None:
@@ -74,12 +74,17 @@ class Transitions:
         self.discounts = (gamma ** (self.later - self.rows)).astype(np.float32)
         if not rewarded:
             return
-        rewards = np.asarray(store.array("rewards")[:])
+        rewards = _of_rows(store, "rewards").astype(np.float32)
+        bad = np.flatnonzero(~np.isfinite(rewards[self.rows]))
+        if len(bad):
+            raise UserError(
+                f"{store.path}: 'rewards' is NaN or infinite at row {self.rows[bad[0]]}; {len(bad)} such rows"
+            )
         for ahead in range(n_steps):
             inside = self.rows + ahead < last
             self.returns[inside] += gamma**ahead * rewards[self.rows[inside] + ahead]
         if "terminations" in store:
-            ended = np.asarray(store.array("terminations")[:])
+            ended = _of_rows(store, "terminations").astype(bool)
             self.discounts[(self.later == last) & ended[last - 1]] = 0.0
 
     def __len__(self) -> int:
@@ -89,6 +94,14 @@ class Transitions:
         """Raise UserError where a batch is larger than the data."""
         if batch_size > len(self):
             raise UserError(f"--batch_size {batch_size}: {self.path} has {len(self)} transitions to train on")
+
+
+def _of_rows(store: EpisodeStore, name: str) -> np.ndarray:
+    """(N,) of a key, whatever another program wrote it as."""
+    array = np.asarray(store.array(name)[:])
+    if array.size != store.rows:
+        raise UserError(f"{store.path}: '{name}' has shape {array.shape}, expected ({store.rows},)")
+    return array.reshape(-1)
 
 
 def _check_bounds(store: EpisodeStore, rows: np.ndarray) -> None:

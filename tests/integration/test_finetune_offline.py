@@ -6,6 +6,10 @@ import csv
 import json
 import math
 import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import av
@@ -16,6 +20,7 @@ from offline_stores import VIEW, make_bundle, register_quadrants, write_offline
 
 from repdib_lightning.__main__ import main
 from repdib_lightning.data.episodes import EpisodeStore
+from repdib_lightning.errors import UserError
 from repdib_lightning.export import load_encoder
 from repdib_lightning.records import ActionSpec
 from repdib_lightning.rl.environment import open_environment
@@ -95,8 +100,9 @@ def test_on_a_frozen_encoder(data, bundle, here, capsys):
     assert all(math.isfinite(float(value)) for row in table for value in row.values())
 
     found = outcome("r")
-    assert set(found) == {"agent", "environment", "versions", "configuration", "data", "measures", "maps"}
-    assert found["agent"] == "td3bc" and found["environment"] == "control"
+    told = {"agent", "environment", "environment_options", "versions", "configuration", "data", "measures", "maps"}
+    assert set(found) == told and found["agent"] == "td3bc" and found["environment"] == "repdib/Control-v0"
+    assert found["environment_options"]["evaluation"] and "task" in found["environment_options"]
     assert found["data"] == {"file": "cartpole.h5", "fingerprint": EpisodeStore(data).fingerprint}
     assert found["configuration"] == json.loads(Path("r/finetune.json").read_text())
     assert found["configuration"]["values"]["alpha"] == 2.5 and found["configuration"]["encoder"] == bundle
@@ -190,7 +196,7 @@ def test_imported_vd4rl_is_evaluated_in_paper_quality(here, monkeypatch):
     assert finetune("td3bc", "vd4rl.h5", "--run", "r", *TINY, *FRESH) == 0
     options = {"task": "walker_walk", "action_repeat": 2, "image_size": PIXELS, "quality": "paper", "evaluation": True}
     assert opened == [("repdib/Control-v0", options)] * 2
-    assert outcome("r")["environment"] == "dm_control/walker_walk"
+    assert outcome("r")["environment"] == "repdib/Control-v0" and outcome("r")["environment_options"] == options
 
 
 def complaint(capsys, agent, data, *options):
@@ -322,4 +328,45 @@ def test_a_training_that_diverges_is_one_line(data, bundle, here, capsys):
     assert finetune("td3bc", data, "--run", "r", *options) == 2
     error = capsys.readouterr().err.strip().splitlines()
     assert len(error) == 1 and error[0].startswith("error: train/") and "smaller --learning_rate" in error[0]
+    assert not Path("r/outcome.json").exists()
+
+
+def test_divergence_is_one_line_where_the_agent_is_evaluated(data, bundle, here, capsys):
+    options = ["--encoder", bundle, "--run", "r", *TINY, "--learning_rate", "1e30", "--steps", "9"]
+    assert finetune("td3bc", data, *options) == 2
+    assert "smaller --learning_rate" in capsys.readouterr().err and not Path("r/outcome.json").exists()
+
+
+def test_what_a_suite_asks_before_hours_of_pretraining(data, here, tmp_path):
+    from repdib_lightning.verbs import check_finetune
+
+    check_finetune(["td3bc", "--data", data, *TINY])
+    check_finetune(["td3bc", "--data", "not_yet.h5", *TINY])
+    poor = write_offline(tmp_path / "poor.h5", rewards=False)
+    for words, said in (
+        (["--data", data, "--env_options.task", "cheetah-run"], "was recorded with cartpole-balance"),
+        (["--data", data, "--batch_size", "9999"], "transitions to train on"),
+        (["--data", str(poor)], "has no 'rewards'"),
+        (["--data", data, "--env_options.quality", "papr"], "unknown, did you mean 'paper'"),
+    ):
+        with pytest.raises(UserError, match=said):
+            check_finetune(["td3bc", *TINY, *words])
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_stopped_training_says_so_by_its_exit_code(data, bundle, here, number, code):
+    options = ["--data", data, "--encoder", bundle, "--run", "r", "--env", "none", "--steps", "1000000",
+               "--batch_size", "16", "--hidden", "16", "--device", "cpu", "--evaluate_every", "20"]  # fmt: skip
+    command = [sys.executable, "-m", "repdib_lightning", "finetune", "td3bc", *options]
+    heeded = lambda: signal.signal(signal.SIGINT, signal.default_int_handler)  # noqa: E731 (a shell may ignore it)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heeded)
+    try:
+        for _ in range(1200):
+            if Path("r/progress.csv").is_file():
+                break
+            time.sleep(0.05)
+        process.send_signal(number)
+        assert process.wait(60) == code
+    finally:
+        process.kill()
     assert not Path("r/outcome.json").exists()

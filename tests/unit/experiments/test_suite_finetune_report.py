@@ -154,8 +154,8 @@ def test_a_second_grids_claims_are_held_against_it(results):
     assert second.holds and second.estimate.value == pytest.approx(0.2)
     table = reports._headline_part(results)[0].tables[0]
     assert [row[1] for row in table.rows] == [
-        "value of dqn/Spiral/success, scratch",
-        "difference of dqn/Spiral/success, vq against none (grid noisy)",
+        "value of dqn/Spiral/success, scratch, 2 seeds",
+        "difference of dqn/Spiral/success, vq against none (grid noisy), 2 seeds",
     ]
 
 

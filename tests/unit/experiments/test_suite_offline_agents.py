@@ -11,11 +11,15 @@ import yaml
 sys.path.insert(0, str(Path(__file__).parent))
 from finished_points import finish, typical
 
+from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.errors import UserError
+from repdib_lightning.experiments import headline
 from repdib_lightning.experiments.film_part import frames_of
 from repdib_lightning.experiments.measures import collect_measures
 from repdib_lightning.experiments.points import points_of
 from repdib_lightning.experiments.report import report_suite
+from repdib_lightning.experiments.results import load_results
+from repdib_lightning.experiments.run import check_recorded_as
 from repdib_lightning.experiments.suite_file import read_suite
 from repdib_lightning.rl.film import side_by_side, write_film
 
@@ -130,3 +134,35 @@ def test_a_grid_may_be_probed_otherwise(tmp_path):
     ):
         with pytest.raises(UserError, match=said):
             read_suite(write(tmp_path, grids={"tail": {**TAIL, "probe": probe}}))
+
+
+def test_a_run_that_grids_share_is_probed_by_the_first_one_which_must_have_all_probes(tmp_path):
+    wider = {**TAIL, "probe": {"probes": "linear,decoder"}}
+    with pytest.raises(
+        UserError, match=r"grids\.tail: 'none' is run once, for grid 'head', whose probes lack 'decoder'"
+    ):
+        read_suite(write(tmp_path, probe={"probes": "linear"}, grids={"head": HEAD, "tail": wider}))
+    read_suite(write(tmp_path, probe={"probes": "linear"}, grids={"tail": wider, "head": HEAD}))
+
+
+def test_a_grid_shows_its_own_seeds_and_three_seeds_prove_nothing(tmp_path):
+    claim = {"setting": "none", "grid": "tail", "measure": "linear/cell/kept", "at_least": 0.5, "judge": "interval"}
+    alone = {"settings": {"none": {"config": "bottleneck/none"}}}
+    path = write(tmp_path, finetune=None, claims={"kept": claim}, grids={"head": alone, "tail": TAIL})
+    suite, runs = read_suite(path), tmp_path / "runs"
+    finish(suite, runs, typical)
+    results = load_results(suite, suite.seeds, runs)
+    first, second = (next(s for s in grid.settings if s.name == "none") for grid in suite.grids)
+    assert sorted(results.values(first, "linear/cell/kept")) == [0, 1, 2]
+    assert sorted(results.values(second, "linear/cell/kept")) == [0, 1]
+    (verdict,) = headline.verdicts(results)
+    assert verdict.estimate.value == 1.0 and verdict.holds is None and verdict.seeds == 2
+
+
+def test_a_store_that_was_recorded_otherwise_than_the_suite_says_is_refused(tmp_path, make_store):
+    recorded = {"distractors": "video", "samples": 10}
+    store = EpisodeStore(make_store(tmp_path / "a.h5", attributes={"configuration": recorded}))
+    check_recorded_as(store, ["control", "--distractors", "video", "--quality", "fast"], Path("s.yaml"))
+    check_recorded_as(store, [], Path("s.yaml"))
+    with pytest.raises(UserError, match=r"a\.h5: was recorded with distractors video, s\.yaml collects it with image"):
+        check_recorded_as(store, ["control", "--distractors", "image"], Path("s.yaml"))

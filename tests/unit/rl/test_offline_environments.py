@@ -54,7 +54,12 @@ def test_options_go_over_those_of_the_recording(env):
 
 @pytest.mark.parametrize(
     ("option", "given", "recorded"),
-    [("action_repeat", 2, 4), ("task", "cheetah-run", "walker-walk"), ("image_size", 64, 24)],
+    [
+        ("action_repeat", 2, 4),
+        ("task", "cheetah-run", "walker-walk"),
+        ("image_size", 64, 24),
+        ("distractor_seed", 4, 3),
+    ],
 )
 @pytest.mark.parametrize("env", ["", "Control"])
 def test_another_problem_than_the_recorded_one_is_refused(env, option, given, recorded):
@@ -76,7 +81,24 @@ def test_imported_vd4rl_is_evaluated_as_it_was_recorded_there():
         evaluated_environment(vd4rl(), "", {"action_repeat": 4})
 
 
-@pytest.mark.parametrize("attributes", [{}, {"environment": "robot_arm"}, {"environment": "my own"}])
+def test_published_sets_that_change_the_scene_need_a_name():
+    data = store(environment="dm_control/walker_walk", vd4rl_set="main/walker_walk/expert/84px")
+    assert evaluated_environment(data, "", {})[0] == CONTROL
+    data.attributes["vd4rl_set"] = "distracting/walker_walk/expert/84px"
+    with pytest.raises(UserError, match="does not tell in which environment it was recorded"):
+        evaluated_environment(data, "", {})
+
+
+def test_without_distractors_their_place_and_source_are_left_out():
+    recorded = control(source="my clips", place="side")
+    _, options = evaluated_environment(recorded, "", {"distractors": "none"})
+    assert "place" not in options and "source" not in options
+    assert evaluated_environment(recorded, "", {})[1]["source"] == "my clips"
+
+
+@pytest.mark.parametrize(
+    "attributes", [{}, {"environment": "control"}, {"environment": "robot_arm"}, {"environment": "my own"}]
+)
 def test_data_of_another_environment_need_a_name(attributes):
     with pytest.raises(UserError) as caught:
         evaluated_environment(store(**attributes), "", {})
@@ -85,7 +107,8 @@ def test_data_of_another_environment_need_a_name(attributes):
         "with --env none"
     )
     assert evaluated_environment(store(**attributes), "Pendulum-v1", {"g": 3}) == ("Pendulum-v1", {"g": 3})
-    assert evaluated_environment(store(**attributes), "Control", {"image_size": 20}) == ("Control", {"image_size": 20})
+    held_out = {"evaluation": True, "image_size": 20}
+    assert evaluated_environment(store(**attributes), "Control", {"image_size": 20}) == ("Control", held_out)
 
 
 def test_another_environment_than_the_recorded_one_takes_its_own_options():

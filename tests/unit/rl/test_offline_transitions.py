@@ -159,3 +159,31 @@ def test_a_batch_larger_than_the_data_is_refused(store):
     Transitions(store).check_batch(22)
     with pytest.raises(UserError, match=r"--batch_size 23: .*data\.h5 has 22 transitions to train on$"):
         Transitions(store).check_batch(23)
+
+
+def rewritten(tmp_path, name, change):
+    """A store one of whose arrays another program wrote."""
+    path = write_offline(tmp_path / "data.h5")
+    with h5py.File(path, "r+") as file:
+        array = change(file[name][:])
+        del file[name]
+        file[name] = array
+    return EpisodeStore(path)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32, np.int64])
+def test_ends_and_rewards_of_other_types_count_as_they_are(tmp_path, store, dtype):
+    other = rewritten(tmp_path, "terminations", lambda array: array.astype(dtype))
+    np.testing.assert_array_equal(Transitions(other, n_steps=3).discounts, Transitions(store, n_steps=3).discounts)
+    (tmp_path / "data.h5").unlink()
+    other = rewritten(tmp_path, "rewards", lambda array: array.astype(np.float64)[:, None])
+    np.testing.assert_allclose(Transitions(other, n_steps=3).returns, Transitions(store, n_steps=3).returns, rtol=1e-6)
+
+
+def test_rewards_that_are_no_numbers_are_named(tmp_path):
+    def spoilt(array):
+        array[1] = np.nan
+        return array
+
+    with pytest.raises(UserError, match=r"data.h5: 'rewards' is NaN or infinite at row 1; 1 such rows"):
+        Transitions(rewritten(tmp_path, "rewards", spoilt))
