@@ -47,9 +47,9 @@ def finetune_td3bc(
     """Train TD3+BC on a store (paper, offline visual control): on latents of a frozen encoder, or end to end.
 
     With ``--encoder`` every frame is encoded once and the agent trains on vectors. Without it the critic trains an
-    encoder on randomly shifted pictures, after V-D4RL's DrQ+BC. Only training episodes are used. Writes ``progress.csv``,
-    ``outcome.json``, ``policy.safetensors``, ``evaluation.mp4``, TensorBoard files, and ``bundle/`` where the encoder
-    was trained, into the run's folder.
+    encoder on randomly shifted pictures, after V-D4RL's DrQ+BC. Only training episodes are used. Writes
+    ``progress.csv``, ``outcome.json``, ``policy.safetensors``, ``evaluation.mp4``, TensorBoard files, and ``bundle/``
+    where the encoder was trained, into the run's folder.
 
     Args:
         data: a store with continuous actions and rewards.
