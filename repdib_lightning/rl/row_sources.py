@@ -50,10 +50,11 @@ class Latents:
         self._place = np.full(store.rows, -1)
         self._place[rows] = np.arange(len(rows))
         torch.manual_seed(seed)
-        self.copies = np.empty((copies, len(rows), encoder.features), np.float32)
+        encoded = []
         for copy in range(copies):
             seen = encoder if copy == 0 else _Shifted(encoder, shift)
-            self.copies[copy] = encode_rows(seen, store, rows, device=encoder.device, progress=progress)[0]
+            encoded.append(encode_rows(seen, store, rows, device=encoder.device, progress=progress)[0])
+        self.copies = encoded[0][None] if copies == 1 else np.stack(encoded)
         # By torch, whose running sums stay exact over many rows, also where a dimension never varies.
         self.deviation, self.mean = torch.std_mean(torch.from_numpy(self.copies), (0, 1), correction=0)
 
