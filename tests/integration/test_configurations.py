@@ -248,7 +248,8 @@ def test_the_suite_of_offline_control(here, capsys):
     plan["finetune"]["with"] = {"steps": 10, "hidden": 32, "batch_size": 16, "episodes": 2, "film": 1}
     steps = {"trainer.max_steps": 3, "trainer.val_check_interval": 2, "data.batch_size": 8}
     at_once = {"model.bottleneck.init_args.start_step": 1, "trainer.log_every_n_steps": 1}
-    plan["grids"] = {"headline": {"settings": {"repdib": {**steps, **at_once}}}}
+    probe = plan["grids"]["headline"]["probe"]
+    plan["grids"] = {"headline": {"probe": probe, "settings": {"repdib": {**steps, **at_once}}}}
     plan |= {"seeds": [0], "claims": {}, "films": ["headline/repdib"], "show": ["repdib"]}
     Path("control.yaml").write_text(yaml.safe_dump(plan))
     for command in suite_commands("control"):
