@@ -189,7 +189,7 @@ def test_bad_options_of_the_decoder_and_the_samples_are_found_before_the_work(tm
     monkeypatch.setattr(probe_module, "encode_rows", lambda *_, **__: pytest.fail("encoded before the checks"))
     (tmp_path / "file").touch()
     for options, words in (
-        ({"probes": "decoder"}, r"probes: at least one of the factors is needed .*linear"),
+        ({"probes": "decoder"}, r"probes: at least one of the factors is needed, .*linear"),
         ({"probes": "linear,decodr"}, r"unknown probe 'decodr'.*did you mean 'decoder'"),
         ({"samples": tmp_path / "x.json"}, r"--samples must end in \.npz"),
         ({"samples": tmp_path / "file" / "x.npz"}, r"--samples .*x\.npz: cannot be written"),
