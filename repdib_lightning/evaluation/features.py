@@ -14,6 +14,9 @@ from repdib_lightning.data.sampling import gather_stacks
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.records import ArraySpec, DataSpec
 
+_CPU_BATCH, _GPU_BATCH = 64, 512
+"""Rows encoded at a time. On a CPU what the layers hand on then stays in its cache: up to twice as fast as 512."""
+
 
 class Encodes(Protocol):
     """What a probe asks of an encoder; ``export.load_encoder`` returns one.
@@ -73,11 +76,11 @@ def encode_rows(
     store: EpisodeStore,
     rows: np.ndarray,
     *,
-    batch_size: int = 512,
+    batch_size: int | None = None,
     device: str | torch.device = "cpu",
     progress: bool = True,
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Encode (n,) rows of a store with a frozen encoder that lives on ``device``.
+    """Encode (n,) rows of a store with a frozen encoder that lives on ``device``, ``batch_size`` at a time.
 
     Returns:
         latents (n, M) float32, and codes (n, G) int64 or None where nothing is quantised.
@@ -87,6 +90,7 @@ def encode_rows(
     """
     latents = np.empty((len(rows), encoder.features), np.float32)
     codes = np.empty((len(rows), encoder.groups), np.int64) if encoder.groups else None
+    batch_size = batch_size or (_CPU_BATCH if torch.device(device).type == "cpu" else _GPU_BATCH)
     starts = range(0, len(rows), batch_size)
     with torch.inference_mode():
         for start in tqdm(starts, desc="encode", unit="batch", disable=None if progress else True, leave=False):
