@@ -185,7 +185,7 @@ def _refuse(config: Namespace) -> None:
 def _describe_model(cli: TrainingCLI) -> None:
     """Write into the run's folder what ``export`` needs to build encoder and bottleneck again."""
     store = cli.datamodule.store
-    training = {"objective": type(cli.model.objective).__name__, "run": cli.folder.name}
+    training = {"objective": cli.model.objective.label, "run": cli.folder.name}
     data = {"file": store.path.name, "fingerprint": store.fingerprint}
     write_model_description(cli.folder, cli.model.encoder, cli.model.bottleneck, training=training, data=data)
 

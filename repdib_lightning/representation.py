@@ -10,10 +10,11 @@ import torch
 from lightning.pytorch.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor
 
-from repdib_lightning.bottlenecks.base import DEFAULT_LOSS_WEIGHTS, Bottleneck
+from repdib_lightning.bottlenecks.base import Bottleneck
 from repdib_lightning.encoders.augmentation import random_shift
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.loss_weights import DEFAULT_LOSS_WEIGHTS
 from repdib_lightning.means import SampleMeans
 from repdib_lightning.objectives.base import Objective
 from repdib_lightning.records import Batch, BottleneckOutput, DataSpec, ObjectiveOutput
@@ -32,7 +33,7 @@ class RepresentationModule(pl.LightningModule):
         optimizer: builds the optimiser from the parameters.
         scheduler: builds a learning-rate scheduler from the optimiser, advanced at every step; none by default.
         loss_weights: weight of each named loss term; unnamed ones keep their default
-            (``bottlenecks.base.DEFAULT_LOSS_WEIGHTS``: kl 0.01, commitment 0.25, ...; 1 where none is listed).
+            (``repdib_lightning.loss_weights``: kl 0.01, commitment 0.25, ...; 1 where none is listed).
         warmup: term -> steps over which its weight rises linearly from 0.
         shift: random shift of the pictures while training, in pixels (DrQ-v2: 4 at 84 px); 0 turns it off.
     """

@@ -22,6 +22,11 @@ class Objective(nn.Module):
 
     needs_actions: bool = False
 
+    @property
+    def label(self) -> str:
+        """What a bundle says its encoder was trained with."""
+        return type(self).__name__
+
     def forward(self, batch: Batch, encode: Encode) -> ObjectiveOutput:
         """Encode what is needed with one call of ``encode``, and return unweighted losses."""
         raise NotImplementedError

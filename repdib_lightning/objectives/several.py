@@ -40,6 +40,11 @@ class SeveralObjectives(Objective):
         self.parts = nn.ModuleList(build(width, spec) for build in parts)
         self.needs_actions = any(bool(part.needs_actions) for part in self.parts)
 
+    @property
+    def label(self) -> str:
+        """The labels of all parts."""
+        return " + ".join(str(part.label) for part in self.parts)
+
     def forward(self, batch: Batch, encode: Encode) -> ObjectiveOutput:
         """Encode (B, F) frames once and hand the latents to every part."""
         latents: list[Tensor] = []

@@ -11,8 +11,8 @@ import torch
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor
 
-from repdib_lightning.bottlenecks.base import DEFAULT_LOSS_WEIGHTS
 from repdib_lightning.export.rebuild import rebuild
+from repdib_lightning.loss_weights import DEFAULT_LOSS_WEIGHTS
 from repdib_lightning.rl.ride_along import ride_along
 
 

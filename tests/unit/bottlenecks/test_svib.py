@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from repdib_lightning.bottlenecks import SVIB, Variational
-from repdib_lightning.bottlenecks.base import DEFAULT_LOSS_WEIGHTS
 from repdib_lightning.encoders import ConvolutionalEncoder
 from repdib_lightning.errors import UserError
 from repdib_lightning.export import load_encoder, save_bundle
 from repdib_lightning.export.formats import example_batch
+from repdib_lightning.loss_weights import DEFAULT_LOSS_WEIGHTS
 from repdib_lightning.records import ArraySpec, DataSpec
 
 M = 6

@@ -8,7 +8,7 @@ import math
 import torch
 from torch import nn
 
-from repdib_lightning.bottlenecks.base import DEFAULT_LOSS_WEIGHTS
+from repdib_lightning.loss_weights import DEFAULT_LOSS_WEIGHTS
 from repdib_lightning.objectives import DynamicBottleneck
 from repdib_lightning.objectives.momentum import MomentumCopy
 from repdib_lightning.records import ActionSpec, ArraySpec, Batch, DataSpec

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from repdib_lightning.bottlenecks.base import DEFAULT_LOSS_WEIGHTS
+from repdib_lightning.loss_weights import DEFAULT_LOSS_WEIGHTS
 from repdib_lightning.objectives import EMI
 from repdib_lightning.records import ActionSpec, ArraySpec, Batch, DataSpec
 

@@ -112,6 +112,7 @@ def test_several_objectives_share_one_encoding_and_keep_their_losses():
             assert torch.equal((output.losses | output.metrics)[name], value), name
     assert set(output.losses) == {"inverse", "contrast", "forward"}
     assert several.needs_actions
+    assert several.label == "InverseDynamics + InfoNCE + ForwardPrediction"
     assert not SeveralObjectives(6, WITH_NEXT, parts=[InfoNCE]).needs_actions
 
 
