@@ -57,7 +57,7 @@ def collect_measures(run: Path, probe: Path | None, outcomes: Mapping[str, Path]
     """
     facts = Facts({}, {}, {}, {}, {}) if probe is None else _pretrained(run, probe)
     for name, path in (outcomes or {}).items():
-        facts = _with_outcome(facts, name, path)
+        facts = _with_outcome(facts, name, path, run)
     return facts
 
 
@@ -73,18 +73,27 @@ def _pretrained(run: Path, probe: Path) -> Facts:
     return Facts(configuration, environment["versions"], environment["data"], factors, metrics)
 
 
-def _with_outcome(facts: Facts, name: str, path: Path) -> Facts:
+def _with_outcome(facts: Facts, name: str, path: Path, run: Path) -> Facts:
     try:
         outcome = json.loads(path.read_text())
         metrics = dict(facts.metrics)
         for measure, value in outcome["measures"].items():
             _add(metrics, f"{outcome['agent']}/{name}/{measure}", value)
-        used = {**facts.configuration.get("finetune", {}), name: outcome["configuration"]}
+        options = _without_folder(outcome["configuration"], run)
+        used = {**facts.configuration.get("finetune", {}), name: options}
         versions, data = facts.versions or outcome["versions"], facts.data or outcome.get("data", {})
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path}: not the outcome of a fine-tuning ({type(error).__name__}: {error})") from error
     configuration = {**facts.configuration, "finetune": used}
     return replace(facts, configuration=configuration, versions=versions, data=data, metrics=metrics)
+
+
+def _without_folder(options: dict[str, Any], run: Path) -> dict[str, Any]:
+    """The encoder's path, within the run's folder: a record says nothing of the machine it was made on."""
+    encoder = options.get("encoder")
+    if not encoder or not Path(encoder).is_relative_to(run):
+        return options
+    return {**options, "encoder": str(Path(encoder).relative_to(run))}
 
 
 def _trained(run: Path) -> dict[str, float]:

@@ -74,6 +74,16 @@ def test_the_data_of_a_run_without_pretraining_are_those_of_its_agent(tmp_path):
     assert facts.data["fingerprint"] == "abc" and facts.metrics == {"td3bc/walk/return": 5.0}
 
 
+def test_a_record_names_the_encoder_within_its_folder_and_no_folder_of_the_machine(tmp_path):
+    path = tmp_path / "outcome.json"
+    recorded_of = {str(tmp_path / "bundle"): "bundle", "/elsewhere/bundle": "/elsewhere/bundle", None: None}
+    for encoder, recorded in recorded_of.items():
+        options = {"encoder": encoder, "steps": 5}
+        path.write_text(json.dumps({"agent": "bc", "versions": {}, "configuration": options, "measures": {}}))
+        used = collect_measures(tmp_path, None, {"walk": path}).configuration["finetune"]["walk"]
+        assert used == {"encoder": recorded, "steps": 5}
+
+
 def test_the_report_holds_the_films_of_the_settings_that_are_named(tmp_path):
     path = write(tmp_path, films=["head/scratch", "tail/vq"])
     suite, runs = read_suite(path), tmp_path / "runs"
