@@ -19,6 +19,7 @@ VERBS = {
     "export": ("repdib_lightning.verbs:export", "make a frozen encoder bundle of a run: export runs/x"),
     "encode": ("repdib_lightning.verbs:encode", "a data set as vectors: encode runs/x data/x.h5 data/x_latents.h5"),
     "probe": ("repdib_lightning.verbs:probe", "what a bundle kept and dropped: probe runs/x/bundle data/x.h5"),
+    "figures": ("repdib_lightning.verbs:figures", "what each group draws: figures factors runs/x/bundle data/x.h5"),
     "compare": ("repdib_lightning.verbs:compare", "probe several bundles side by side into one HTML report"),
     "finetune": ("repdib_lightning.verbs:finetune", "RL on a bundle: finetune dqn --env SpiralWorld --encoder BUNDLE"),
     "suite": ("repdib_lightning.verbs:suite", "grids of runs over seeds: suite run|status|report robot_arm"),

@@ -12,10 +12,11 @@ from torch import nn
 class RememberedArguments(nn.Module):
     """An ``nn.Module`` whose subclasses record their keyword arguments in ``self.arguments``.
 
-    The first constructor parameter (a spec or a width, supplied by the package) is left out; everything else must be
-    plain: strings, numbers, booleans, None, and lists or dictionaries of these.
+    The first constructor parameters (a spec or a width, supplied by the package; ``supplied`` of them) are left out;
+    everything else must be plain: strings, numbers, booleans, None, and lists or dictionaries of these.
     """
 
+    supplied: int = 1
     arguments: dict[str, Any]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -30,7 +31,7 @@ class RememberedArguments(nn.Module):
             if type(self) is cls:
                 bound = signature.bind(self, *args, **given)
                 bound.apply_defaults()
-                arguments = dict(list(bound.arguments.items())[2:])
+                arguments = dict(list(bound.arguments.items())[1 + cls.supplied :])
             build(self, *args, **given)
             if type(self) is cls:
                 self.arguments = arguments

@@ -26,6 +26,7 @@ from repdib_lightning.callbacks.checkpoint_files import step_of
 from repdib_lightning.callbacks.codebook_use import CodebookUse
 from repdib_lightning.callbacks.metrics_csv import MetricsCSV
 from repdib_lightning.callbacks.pictures import Pictures
+from repdib_lightning.callbacks.redrawn import Redrawn
 from repdib_lightning.data.datamodule import EpisodeDataModule
 from repdib_lightning.data.mazes import MazeDataModule
 from repdib_lightning.data.robot_arm import RobotArmDataModule
@@ -93,7 +94,7 @@ class TrainingCLI(LightningCLI):
         kwargs |= {"default_root_dir": str(self.folder), "plugins": [*(given.plugins or []), *run_plugins()]}
         kwargs["use_distributed_sampler"] = False  # the loaders give each process its own share
         safety = run_callbacks(self.folder, config.checkpoint_every, config.checkpoint_keep)
-        self.trainer_defaults = {"callbacks": [Pictures(), CodebookUse(), *safety]}
+        self.trainer_defaults = {"callbacks": [Pictures(), Redrawn(), CodebookUse(), *safety]}
         return super().instantiate_trainer(**kwargs)
 
     def configuration(self) -> str:
@@ -187,7 +188,8 @@ def _describe_model(cli: TrainingCLI) -> None:
     store = cli.datamodule.store
     training = {"objective": cli.model.objective.label, "run": cli.folder.name}
     data = {"file": store.path.name, "fingerprint": store.fingerprint}
-    write_model_description(cli.folder, cli.model.encoder, cli.model.bottleneck, training=training, data=data)
+    modules, drawing = (cli.model.encoder, cli.model.bottleneck), cli.model.objective.find_decoder()
+    write_model_description(cli.folder, *modules, training=training, data=data, drawing=drawing)
 
 
 def validate(arguments: list[str]) -> int:

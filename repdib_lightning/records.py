@@ -48,8 +48,8 @@ class ActionSpec:
 class DataSpec:
     """What a model must know of its data: every width in the package is derived from here.
 
-    ``next_frame`` says that the first future of every sample is the frame after the anchor (``offsets[:, 1] == 1``),
-    in front of those that are drawn.
+    ``horizon`` is 0 where samples are drawn without futures. ``next_frame`` says that the first future of every sample
+    is the frame after the anchor (``offsets[:, 1] == 1``), in front of those that are drawn.
     """
 
     observations: dict[str, ArraySpec]

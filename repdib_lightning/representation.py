@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor
 
-from repdib_lightning.bottlenecks.base import Bottleneck
+from repdib_lightning.bottlenecks import Bottleneck, for_positions
 from repdib_lightning.encoders.augmentation import random_shift
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError, nearest
@@ -28,7 +28,7 @@ class RepresentationModule(pl.LightningModule):
 
     Args:
         encoder: builds the encoder from the data's spec.
-        bottleneck: builds the bottleneck from the width M.
+        bottleneck: builds the bottleneck from the width M, or from that of one position where the encoder gives a grid.
         objective: builds the objective from M and the spec.
         optimizer: builds the optimiser from the parameters.
         scheduler: builds a learning-rate scheduler from the optimiser, advanced at every step; none by default.
@@ -73,9 +73,23 @@ class RepresentationModule(pl.LightningModule):
     def build(self, spec: DataSpec) -> RepresentationModule:
         """Build the parts for data of this spec; for use without a trainer."""
         self.encoder = self.build_encoder(spec)
-        self.bottleneck = self.build_bottleneck(self.encoder.features)
+        self.bottleneck = for_positions(self.build_bottleneck, self.encoder.features, self.encoder.positions)
         self.objective = self.build_objective(self.encoder.features, spec)
+        self._check_drawing()
         return self
+
+    def _check_drawing(self) -> None:
+        """Refuse what would train and could not be drawn: shifted pictures, or one that the encoder does not see."""
+        found = self.objective.find_decoder()
+        if found is None:
+            return
+        if self.shift:
+            raise UserError(
+                f"model.shift is {self.shift}: {self.objective.label} would have to guess the shift; set it to 0"
+            )
+        seen, view = self.encoder.spec.observations, found[1].view
+        if view not in seen:
+            raise UserError(f"model.objective: draws '{view}', the encoder sees {', '.join(seen)}; choose one of these")
 
     @torch.no_grad()
     def rehearse(self, batch: Batch) -> None:

@@ -19,6 +19,9 @@ SUITE_VERBS = {
 }
 
 
+FIGURES = {"factors": "repdib_lightning.evaluation.factor_figures:draw_factors"}
+
+
 def collect(arguments: list[str]) -> int:
     """``collect ENVIRONMENT PATH [options]``."""
     from repdib_lightning.environments import COLLECTORS
@@ -79,6 +82,13 @@ def finetune(arguments: list[str]) -> int:
     return 0
 
 
+def figures(arguments: list[str]) -> int:
+    """``figures KIND BUNDLE DATA [options]``."""
+    name, rest = _choose("figures", "kind", FIGURES, arguments)
+    print(_call(f"figures {name}", _load(FIGURES[name]), rest))
+    return 0
+
+
 def compare(arguments: list[str]) -> int:
     """``compare DATA OUTPUT RUN [RUN ...]``: ratios are relative to the first run."""
     from repdib_lightning.evaluation.bundles import named_bundles
@@ -89,7 +99,7 @@ def compare(arguments: list[str]) -> int:
 
     curves = {name: path.parent / "metrics.csv" for name, path in bundles.items()}
     known = {name: path for name, path in curves.items() if path.is_file()}
-    chosen = {"probes": options.probes, "seed": options.seed, "device": options.device}
+    chosen = {"probes": options.probes, "groups": options.groups, "seed": options.seed, "device": options.device}
     print(compare_bundles(bundles, options.data, options.output, metrics=known, **chosen))
     print(f"wrote {options.output}")
     return 0
@@ -127,7 +137,10 @@ def _comparison_options(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("data", type=Path, help="a data file with factors")
     parser.add_argument("output", type=Path, help="the HTML page to write (.html)")
     parser.add_argument("runs", nargs="+", help="runs that were exported, or bundles; NAME=PATH names one")
-    parser.add_argument("--probes", default="linear,mlp", help="some of linear,mlp,decoder (default: linear,mlp)")
+    parser.add_argument(
+        "--probes", default="linear,mlp", help="some of linear,mlp,decoder,groups (default: linear,mlp)"
+    )
+    parser.add_argument("--groups", type=int, help="for groups: how many to cut a latent into that is not quantised")
     parser.add_argument("--seed", type=int, default=0, help="of the MLP and of the permutation null (default: 0)")
     parser.add_argument("--device", default="auto", help="runs the encoders (default: auto, a GPU if there is one)")
     return parser.parse_args(arguments)

@@ -5,6 +5,7 @@
 
 from repdib_lightning.bottlenecks.base import Bottleneck
 from repdib_lightning.bottlenecks.identity import Identity
+from repdib_lightning.bottlenecks.per_position import PerPosition, for_positions
 from repdib_lightning.bottlenecks.repdib import RepDIB
 from repdib_lightning.bottlenecks.svib import SVIB
 from repdib_lightning.bottlenecks.variational import Variational
@@ -14,4 +15,14 @@ BOTTLENECKS: dict[str, type[Bottleneck]] = {
     kind.__name__: kind for kind in (Identity, Variational, VectorQuantiser, RepDIB, SVIB)
 }
 
-__all__ = ["BOTTLENECKS", "SVIB", "Bottleneck", "Identity", "RepDIB", "Variational", "VectorQuantiser"]
+__all__ = [
+    "BOTTLENECKS",
+    "SVIB",
+    "Bottleneck",
+    "Identity",
+    "PerPosition",
+    "RepDIB",
+    "Variational",
+    "VectorQuantiser",
+    "for_positions",
+]

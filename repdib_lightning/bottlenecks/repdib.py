@@ -38,6 +38,7 @@ class RepDIB(Bottleneck):
         start_step: training steps before quantising starts; until then this is a :class:`Variational`.
         revive_after: idle steps after which a code is moved; 0 = never.
         bypass: chance that the objective sees a row unquantised in training.
+        group_dropout: chance that the objective sees zeros in place of a group in training.
         noise: where the Gaussian noise of the training enters. ``before``: the sample is quantised, as in the paper;
             noise in front of a nearest-neighbour choice flips codes at random. ``after``: the mean is quantised, and
             the noise is added to the chosen codes, so that training and evaluation choose alike while each dimension
@@ -65,6 +66,7 @@ class RepDIB(Bottleneck):
         start_step: int = 200,
         revive_after: int = 50,
         bypass: float = 0.0,
+        group_dropout: float = 0.0,
         noise: Literal["before", "after"] = "before",
     ) -> None:
         super().__init__(width)
@@ -79,6 +81,8 @@ class RepDIB(Bottleneck):
             kl_reduction=kl_reduction,
             head=head,
         )
+        if group_dropout and noise == "after":
+            raise UserError("RepDIB: noise after the quantiser fills the groups that group_dropout empties; take one")
         self.quantiser = VectorQuantiser(
             width,
             groups=groups,
@@ -90,6 +94,7 @@ class RepDIB(Bottleneck):
             start_step=start_step,
             revive_after=revive_after,
             bypass=bypass,
+            group_dropout=group_dropout,
         )
         self.groups, self.codes = groups, codes
 

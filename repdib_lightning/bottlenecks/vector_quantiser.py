@@ -53,6 +53,9 @@ class VectorQuantiser(Bottleneck):
             0 = never.
         bypass: probability, for each row and training step, that the objective sees the unquantised input. The
             evaluation always quantises.
+        group_dropout: probability, for each row, group and training step, that the objective sees zeros in place of
+            the group, so that what is left must do without it, and a zeroed group is nothing new to a decoder. In a
+            grid each position drops its groups by itself.
 
     Raises:
         UserError: groups that do not divide M, unknown choices, values out of range.
@@ -74,6 +77,7 @@ class VectorQuantiser(Bottleneck):
         start_step: int = 200,
         revive_after: int = 50,
         bypass: float = 0.0,
+        group_dropout: float = 0.0,
     ) -> None:
         super().__init__(width)
         self._check_shape(width, groups, codes)
@@ -83,8 +87,10 @@ class VectorQuantiser(Bottleneck):
         self._check_range("start_step", start_step, start_step >= 0, "at least 0")
         self._check_range("revive_after", revive_after, revive_after >= 0, "at least 0 (0 = never)")
         self._check_range("bypass", bypass, 0 <= bypass <= 1, "in [0, 1]")
+        self._check_range("group_dropout", group_dropout, 0 <= group_dropout < 1, "in [0, 1)")
         self.groups, self.codes, self.shared = groups, codes, shared
         self.start, self.start_step, self.bypass = start, start_step, bypass
+        self.group_dropout = group_dropout
         books = 1 if shared else groups
         self.book = Codebook(books, codes, width // groups, rule=codebook, decay=decay, revive_after=revive_after)
         begins = start == "random" and start_step == 0
@@ -152,7 +158,14 @@ class VectorQuantiser(Bottleneck):
             if self.bypass:
                 drawn = torch.rand(rows_of_all(len(latent)), 1, device=latent.device)
                 quantised = torch.where(own_rows(drawn) < self.bypass, latent, quantised)
+            if self.group_dropout:
+                quantised = self._without_some_groups(quantised)
         return BottleneckOutput(quantised, losses, codes, describe_use(counts))
+
+    def _without_some_groups(self, latent: Tensor) -> Tensor:
+        drawn = torch.rand(rows_of_all(len(latent)), self.groups, 1, device=latent.device)
+        kept = own_rows(drawn) >= self.group_dropout
+        return torch.flatten(latent.reshape(-1, self.groups, self.width // self.groups) * kept, 1)
 
     def _pass_through(self, latent: Tensor) -> BottleneckOutput:
         zero = torch.zeros((), dtype=self.book.vectors.dtype, device=latent.device)

@@ -26,7 +26,7 @@ class EpisodeDataModule(pl.LightningDataModule):
         batch_size: anchors B of a step, over all processes; a step encodes B * (1 + futures) frames, B more
             with ``next_frame``.
         horizon: K, the largest time offset between an anchor and its futures, in steps. 1 gives one-step pairs.
-        futures: futures drawn for each anchor.
+        futures: futures drawn for each anchor; with 0 every row is a sample of its own, and no horizon is needed.
         frame_stack: S, frames stacked into one observation.
         views: observations to use; all by default.
         workers: loader processes; 0 reads in the training process, which is best while the file fits in memory.
@@ -59,9 +59,9 @@ class EpisodeDataModule(pl.LightningDataModule):
         self.batch_size, self.horizon, self.futures = batch_size, horizon, futures
         self.frame_stack, self.views, self.workers, self.seed = frame_stack, views, workers, seed
         self.resident, self.next_frame, self.collect = resident, next_frame, collect
-        for name in ("batch_size", "horizon", "futures", "frame_stack"):
-            if getattr(self, name) < 1:
-                raise UserError(f"data.{name} must be at least 1, is {getattr(self, name)}")
+        for name, least in (("batch_size", 1), ("horizon", 1), ("futures", 0), ("frame_stack", 1)):
+            if getattr(self, name) < least:
+                raise UserError(f"data.{name} must be at least {least}, is {getattr(self, name)}")
         if workers < 0 or seed < 0:
             raise UserError(f"data.workers and data.seed must not be negative, are {workers} and {seed}")
         if resident and workers:
@@ -115,12 +115,15 @@ class EpisodeDataModule(pl.LightningDataModule):
             array = self.store.observations[name]
             shape = (array.shape[0] * self.frame_stack, *array.shape[1:])
             observations[name] = ArraySpec(shape, array.dtype)
-        return DataSpec(observations, self.store.actions_spec, self.frame_stack, self.horizon, self.next_frame)
+        horizon = self.horizon if self.futures else 0
+        return DataSpec(observations, self.store.actions_spec, self.frame_stack, horizon, self.next_frame)
 
-    def example(self) -> Batch:
-        """The first two held-out samples. Only after :meth:`setup`."""
+    def example(self, count: int = 2) -> Batch:
+        """Some held-out samples, evenly spread, since neighbours may be alike. Only after :meth:`setup`."""
         assert self.store is not None
-        return self._frames(self._evaluation, Mapped(self.store)).__getitems__([0, 1])
+        held_out = len(self._evaluation)
+        numbers = [number * held_out // count for number in range(count)] if count < held_out else list(range(held_out))
+        return self._frames(self._evaluation, Mapped(self.store)).__getitems__(numbers)
 
     def train_dataloader(self) -> ResumableLoader:
         """Shuffled anchors of the training episodes, resumable at any batch."""

@@ -69,8 +69,7 @@ def suspicious_content(store: EpisodeStore, samples: dict[str, np.ndarray]) -> l
             )
     if store.actions_spec is None:
         lines.append("there are no actions: objectives that predict them cannot be trained on this file")
-    if (store.lengths < 2).any():
-        lines.append(f"{int((store.lengths < 2).sum())} episodes have one row and are never sampled")
+    lines += _short_episodes(store)
     for name in store.factors:
         values = np.asarray(store.array(f"factors/{name}")[:])
         if (values == values[:1]).all():
@@ -78,6 +77,15 @@ def suspicious_content(store: EpisodeStore, samples: dict[str, np.ndarray]) -> l
         if not np.isfinite(values).all():
             lines.append(f"'factors/{name}' holds NaN or infinite values")
     return lines + _unused_actions(store)
+
+
+def _short_episodes(store: EpisodeStore) -> list[str]:
+    """A line where some episodes have one row; where all have, they are pictures and nothing is wrong."""
+    short = int((store.lengths == 1).sum())
+    if short in (0, len(store.lengths)):
+        return []
+    have = "episode has" if short == 1 else "episodes have"
+    return [f"{short} {have} one row: sampled only with data.futures 0; any other number of futures is refused"]
 
 
 def _is_stacked(store: EpisodeStore, name: str) -> bool:

@@ -10,6 +10,8 @@ import h5py
 from repdib_lightning.data.schema import FORMAT
 
 _IMPORT = "python -m repdib_lightning import"
+_PICTURES = (".jpg", ".jpeg", ".png")
+_VISIBLE = "[!._]*"
 
 
 def describe_foreign(path: Path) -> str | None:
@@ -32,6 +34,18 @@ def _describe_folder(folder: Path) -> str | None:
             return f"{folder}: {len(files)} *.{ending} files, V-D4RL {form}; convert: {_convert_vd4rl(folder)}"
     if any(folder.glob("*.csv")):
         return f"{folder}: a folder with a table of images; convert: {_IMPORT} images {folder} data/NAME.h5"
+    return _describe_picture_tree(folder)
+
+
+def _describe_picture_tree(folder: Path) -> str | None:
+    """Of a folder of the shape of PACS, ``<domain>/<class>/<picture>``; hidden names are none."""
+    for file in folder.glob("/".join([_VISIBLE] * 3)):
+        if file.suffix.lower() in _PICTURES:
+            return (
+                f"{folder}: pictures two folders down, such as {file.relative_to(folder)}; if these folders are "
+                f"domain and class, as in PACS, convert: {_IMPORT} pacs {folder} data/NAME.h5 "
+                "--domains all --classes all"
+            )
     return None
 
 

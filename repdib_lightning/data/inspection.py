@@ -126,7 +126,7 @@ def _head(store: EpisodeStore, checked: str) -> list[str]:
     facts = {
         "size": file_size(store.path.stat().st_size),
         "fingerprint": (store.fingerprint or "none (written by another program)") + checked,
-        "rows": f"{store.rows:,} ({len(acting_rows(store)):,} with an action, one final observation an episode)",
+        "rows": _rows(store),
         "episodes": f"{len(store.lengths):,}; length: {spread(store.lengths)}",
         "evaluation": f"{held_out} episodes, {'as stored' if stored else 'every fifth (none is marked in the file)'}",
     }
@@ -134,6 +134,12 @@ def _head(store: EpisodeStore, checked: str) -> list[str]:
     facts |= {key: str(value) for key, value in sorted(store.attributes.items()) if key not in hidden}
     title = f"{store.path}: episodes, schema {store.attributes['schema_version']}"
     return [title, *table([[key, _shorten(value)] for key, value in facts.items()])]
+
+
+def _rows(store: EpisodeStore) -> str:
+    acting = len(acting_rows(store))
+    with_actions = f" ({acting:,} with an action, one final observation an episode)" if acting else ""
+    return f"{store.rows:,}{with_actions}"
 
 
 def _shorten(text: str, width: int = 100) -> str:

@@ -40,12 +40,13 @@ class FutureSampling:
 
     Each epoch visits every anchor once, in an order drawn from (seed, epoch). An anchor is a row with at least K
     later rows in its episode, so that k is uniform for all of them (AC-State, Lamb et al. 2022; paper section 4.4).
+    Without futures every row is an anchor, also that of an episode of one row.
 
     Args:
         store: the data.
         split: which episodes.
         horizon: K.
-        futures: n, so a sample has F = 1 + n frames.
+        futures: n, so a sample has F = 1 + n frames; 0 where what is learned needs no later frame.
         seed: of the stream.
         next_frame: a sample has F = 2 + n frames, of which the second is t + 1, whatever K. The order and the n futures
             drawn are those without it.
@@ -64,15 +65,16 @@ class FutureSampling:
         seed: int,
         next_frame: bool = False,
     ) -> None:
-        if horizon < 1 or futures < 1:
-            raise UserError(f"horizon ({horizon}) and futures ({futures}) must be at least 1")
+        if horizon < 1 or futures < 0:
+            raise UserError(f"horizon ({horizon}) must be at least 1, futures ({futures}) not negative")
+        ahead = horizon if futures else int(next_frame)
         episodes = store.episodes(split)
         if not len(episodes):
             raise UserError(_empty_split(store, split))
-        short = episodes[store.lengths[episodes] <= horizon]
+        short = episodes[store.lengths[episodes] <= ahead]
         if len(short):
-            raise UserError(_too_short(store, episodes, int(short[0]), horizon))
-        spans = [np.arange(store.starts[e], store.starts[e] + store.lengths[e] - horizon) for e in episodes]
+            raise UserError(_too_short(store, episodes, int(short[0]), ahead, next_frame=next_frame))
+        spans = [np.arange(store.starts[e], store.starts[e] + store.lengths[e] - ahead) for e in episodes]
         self.anchors = np.concatenate(spans)
         self.horizon, self.futures, self.seed, self.next_frame = horizon, futures, seed, next_frame
         self._epoch = -1
@@ -118,15 +120,22 @@ def _empty_split(store: EpisodeStore, split: Split) -> str:
     return f"{store.path}: has no episode for {split} ({len(store.lengths)} in all): {hint}"
 
 
-def _too_short(store: EpisodeStore, episodes: np.ndarray, short: int, horizon: int) -> str:
+def _too_short(store: EpisodeStore, episodes: np.ndarray, short: int, horizon: int, *, next_frame: bool) -> str:
     shortest = int(episodes[np.argmin(store.lengths[episodes])])
     largest = int(store.lengths[shortest]) - 1
     if largest == 0:
-        return (
-            f"{store.path}: episode {shortest} has one row and therefore no step, so that no horizon is valid; "
-            "leave this episode out when the file is written"
-        )
+        return _one_row(store, shortest, next_frame=next_frame)
     return (
         f"{store.path}: episode {short} has {store.lengths[short] - 1} steps, fewer than the horizon {horizon}; "
         f"the largest valid horizon is {largest}"
+    )
+
+
+def _one_row(store: EpisodeStore, episode: int, *, next_frame: bool) -> str:
+    way_out = "set data.futures to 0" + (" and data.next_frame to false" if next_frame else "")
+    if (store.lengths == 1).all():
+        return f"{store.path}: every episode has one row, such as a picture, and no later row to draw; {way_out}"
+    return (
+        f"{store.path}: episode {episode} has one row and therefore no step, so that no horizon is valid; {way_out}, "
+        "with which every row is a sample, or leave this episode out when the file is written"
     )

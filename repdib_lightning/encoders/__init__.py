@@ -3,9 +3,12 @@
 from repdib_lightning.encoders.augmentation import random_shift
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.encoders.convolutional import ConvolutionalEncoder
-from repdib_lightning.encoders.residual import ResNetEncoder
+from repdib_lightning.encoders.residual_blocks import ResidualEncoder
+from repdib_lightning.encoders.resnet import ResNetEncoder
 
-ENCODERS: dict[str, type[Encoder]] = {cls.__name__: cls for cls in (ConvolutionalEncoder, ResNetEncoder)}
+ENCODERS: dict[str, type[Encoder]] = {
+    cls.__name__: cls for cls in (ConvolutionalEncoder, ResNetEncoder, ResidualEncoder)
+}
 """The encoders that a bundle may name."""
 
-__all__ = ["ENCODERS", "ConvolutionalEncoder", "Encoder", "ResNetEncoder", "random_shift"]
+__all__ = ["ENCODERS", "ConvolutionalEncoder", "Encoder", "ResNetEncoder", "ResidualEncoder", "random_shift"]

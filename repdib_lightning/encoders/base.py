@@ -17,7 +17,10 @@ class Encoder(RememberedArguments):
     Attributes:
         spec: the observations it takes (those of the data that it uses).
         features: M, the width of what it returns.
+        positions: of a grid whose features stand one after the other in M, each to be bottlenecked alone; 1 for none.
     """
+
+    positions: int = 1
 
     def __init__(self, spec: DataSpec, features: int) -> None:
         super().__init__()

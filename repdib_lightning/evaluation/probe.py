@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -22,8 +22,10 @@ from repdib_lightning.evaluation.bundles import bundle_of, display_name, protect
 from repdib_lightning.evaluation.codes import CodebookUse, FactorBits, codebook_use, factor_bits
 from repdib_lightning.evaluation.decoder import Drawings, PictureReport, check_pictures, measure_pictures
 from repdib_lightning.evaluation.features import Encodes, check_compatible, encode_rows, resolve_device
+from repdib_lightning.evaluation.group_probe import GroupReport, check_grouped, measure_groups
 from repdib_lightning.evaluation.probes import (
     DECODER,
+    GROUPS,
     PROBES,
     Half,
     ProbeScore,
@@ -84,6 +86,7 @@ class ProbeReport:
         factors: name -> report, endogenous first.
         codebook: use of codes on all evaluation rows; None where nothing is quantised.
         pictures: what the decoder probe drew again; None where it was not asked for.
+        grouped: what the groups hold and draw; None where it was not asked for.
     """
 
     name: str
@@ -99,6 +102,7 @@ class ProbeReport:
     factors: dict[str, FactorReport]
     codebook: CodebookUse | None
     pictures: PictureReport | None = None
+    grouped: GroupReport | None = None
 
     def mean_kept(self, kind: Kind, probe: str) -> float | None:
         """Mean *kept* over the factors of a kind; None if there is none, or none that varies."""
@@ -118,7 +122,8 @@ class ProbeReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionaries, lists, strings, numbers and None (JSON)."""
-        return {**asdict(self), "summary": self.summary()}
+        grouped = None if self.grouped is None else self.grouped.to_dict()
+        return {**asdict(replace(self, grouped=None)), "grouped": grouped, "summary": self.summary()}
 
     def write(self, path: Path) -> None:
         """Write JSON; the file is whole or absent. Raises UserError if the folder cannot be written to."""
@@ -151,6 +156,8 @@ def probe_bundle(
     output: Path | None = None,
     samples: Path | None = None,
     probes: str | Sequence[str] = ",".join(PROBES),
+    groups: int | None = None,
+    clusters: int | None = None,
     device: str = "auto",
     seed: int = 0,
     progress: bool = True,
@@ -162,7 +169,11 @@ def probe_bundle(
         data: a store with factors and at least two evaluation episodes.
         output: the JSON file (.json); ``probe.json`` in the bundle by default.
         samples: also keep some latents, their factors and drawn pictures in this file (.npz), for figures.
-        probes: ``linear``, ``mlp``, ``decoder`` (draws the pictures again from the latent), or several between commas.
+        probes: ``linear``, ``mlp``, ``decoder`` (draws the pictures again from the latent), ``groups`` (what each group
+            of codes holds; with the bundle's own decoder also what it draws), or several between commas.
+        groups: for ``groups``, how many to cut a latent into that is not quantised.
+        clusters: for ``groups``, how many codes k-means gives each part of such a latent; 512 by default, and at most
+            one for 8 training rows.
         device: runs the encoder; the probes run on the CPU.
         seed: of the MLP and of the permutation null.
         progress: show progress bars (on a terminal).
@@ -171,7 +182,7 @@ def probe_bundle(
         UserError: bad bundle or data, observations that do not match, no factors, too few evaluation episodes, or an
             output that is no .json file, cannot be written or would replace what is read.
     """
-    chosen = check_options(probes, seed)
+    chosen = check_options(probes, seed, groups, clusters)
     folder = bundle_of(Path(bundle))
     target = folder / "probe.json" if output is None else Path(output)
     encoder = load_for_probing(folder, device)
@@ -180,13 +191,35 @@ def probe_bundle(
         check_output_file(Path(samples), "--samples", ".npz", [Path(data)])
     store = open_for_probing(data, chosen)
     check_compatible(encoder, store, str(folder))
+    if GROUPS in chosen:
+        check_grouped(encoder, groups)
     encoded = encode_evaluation(encoder, store, device=encoder.device, progress=progress)
     name = display_name(folder)
     report, drawings = probe_encoded(encoded, store, name=name, probes=chosen, seed=seed, progress=progress)
+    if GROUPS in chosen:
+        grouped = probe_groups(encoder, folder, store, groups=groups, clusters=clusters, seed=seed, progress=progress)
+        report = replace(report, grouped=grouped)
     if samples is not None:
         draw_samples(encoded, store, drawings).write(Path(samples))
     report.write(target)
     return report
+
+
+def probe_groups(
+    encoder: FrozenEncoder,
+    bundle: Path,
+    store: EpisodeStore,
+    *,
+    groups: int | None,
+    clusters: int | None = None,
+    seed: int,
+    progress: bool = True,
+) -> GroupReport:
+    """Measure what the groups hold, and draw if the bundle has a decoder."""
+    from repdib_lightning.export import load_decoder
+
+    decoder = load_decoder(bundle, encoder.device) if "decoder" in encoder.description else None
+    return measure_groups(encoder, decoder, store, groups=groups, clusters=clusters, seed=seed, progress=progress)
 
 
 def draw_samples(encoded: Encoded, store: EpisodeStore, drawings: Drawings | None) -> ProbeSamples:
@@ -197,14 +230,22 @@ def draw_samples(encoded: Encoded, store: EpisodeStore, drawings: Drawings | Non
     return ProbeSamples(rows[thin], encoded.latents[thin], factors, drawings)
 
 
-def check_options(probes: str | Sequence[str], seed: int) -> tuple[str, ...]:
+def check_options(
+    probes: str | Sequence[str], seed: int, groups: int | None = None, clusters: int | None = None
+) -> tuple[str, ...]:
     """Check what needs no file, and return the names of the probes.
 
     Raises:
-        UserError: an unknown probe, none, or a seed that no generator takes.
+        UserError: an unknown probe, none, a seed that no generator takes, or groups that nothing would use.
     """
     chosen = words(probes, "probes")
     check_probes(chosen)
+    if groups is not None and GROUPS not in chosen:
+        raise UserError(f"--groups is of the probe '{GROUPS}': add it to --probes, or leave the option out")
+    if clusters is not None and GROUPS not in chosen:
+        raise UserError(f"--clusters is of the probe '{GROUPS}': add it to --probes, or leave the option out")
+    if clusters is not None and clusters < 2:
+        raise UserError(f"--clusters must be at least 2, is {clusters}")
     if not 0 <= seed < 2**63:
         raise UserError(f"seed must be at least 0 and below 2^63, is {seed}")
     return chosen
@@ -265,7 +306,7 @@ def probe_encoded(
     in_fit = np.isin(episodes, split.fit)
     features = Standardiser(encoded.latents[in_fit])(encoded.latents)
     reports = {}
-    by_factor = tuple(probe for probe in probes if probe != DECODER)
+    by_factor = tuple(probe for probe in probes if probe not in (DECODER, GROUPS))
     ordered = sorted(store.factors.items(), key=lambda item: (item[1].kind, item[0]))
     for factor, spec in tqdm(ordered, desc="probe", unit="factor", disable=None if progress else True, leave=False):
         target = as_target(store.gather(f"factors/{factor}", rows), spec)

@@ -6,7 +6,7 @@ import base64
 import html
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from repdib_lightning.evaluation import curves, figures
 from repdib_lightning.evaluation.bundles import protected_files
 from repdib_lightning.evaluation.decoder import Drawings
 from repdib_lightning.evaluation.features import check_compatible
+from repdib_lightning.evaluation.group_probe import check_grouped
 from repdib_lightning.evaluation.probe import (
     Encoded,
     ProbeReport,
@@ -28,8 +29,10 @@ from repdib_lightning.evaluation.probe import (
     load_for_probing,
     open_for_probing,
     probe_encoded,
+    probe_groups,
 )
-from repdib_lightning.evaluation.probes import PROBES
+from repdib_lightning.evaluation.probes import GROUPS, PROBES
+from repdib_lightning.evaluation.splits import rows_of
 from repdib_lightning.evaluation.tables import comparison_table, notes
 
 SCATTERED = 2000
@@ -81,6 +84,7 @@ def compare(
     metrics: Mapping[str, Path] | None = None,
     title: str = "What the representation kept and dropped",
     probes: str | Sequence[str] = PROBES,
+    groups: int | None = None,
     device: str = "auto",
     seed: int = 0,
     progress: bool = True,
@@ -93,27 +97,34 @@ def compare(
         output: the HTML file (.html). Beside it ``<stem>.json`` holds every report in full, ``<stem>-kept.png`` the
             bars; files of these names are replaced.
         metrics: run name -> metrics.csv, for the training curves.
-        title, probes, device, seed, progress: as in :func:`repdib_lightning.evaluation.probe.probe_bundle`.
+        title, probes, groups, device, seed, progress: as in :func:`repdib_lightning.evaluation.probe.probe_bundle`.
 
     Raises:
         UserError: as ``probe_bundle`` does; nothing is written then. All bundles are read before any is probed.
     """
     if not bundles:
         raise UserError("compare: at least one bundle is needed")
-    chosen = check_options(probes, seed)
+    chosen = check_options(probes, seed, groups)
     output, data, metrics = Path(output), Path(data), metrics or {}
     check_outputs(output, [data, *(file for bundle in bundles.values() for file in protected_files(Path(bundle)))])
     encoders = {name: load_for_probing(Path(bundle), device) for name, bundle in bundles.items()}
     for path in metrics.values():
         curves.read_curves(path)
     store = open_for_probing(data, chosen)
+    all_quantised = all(encoder.groups for encoder in encoders.values())
+    cuts = {name: groups if all_quantised or not encoder.groups else None for name, encoder in encoders.items()}
     for name, encoder in encoders.items():
         check_compatible(encoder, store, str(bundles[name]))
+        if GROUPS in chosen:
+            check_grouped(encoder, cuts[name])
     runs = {}
     for name, encoder in encoders.items():
         encoded = encode_evaluation(encoder, store, device=encoder.device, progress=progress)
         report, drawings = probe_encoded(encoded, store, name=name, probes=chosen, seed=seed, progress=progress)
         place = Path(bundles[name])
+        if GROUPS in chosen:
+            grouped = probe_groups(encoder, place, store, groups=cuts[name], seed=seed, progress=progress)
+            report = replace(report, grouped=grouped)
         runs[name] = RunResult(report, encoded, encoder.description, metrics.get(name), place, drawings)
     write_comparison(output, runs, store, title=title)
     reports = {name: run.report for name, run in runs.items()}
@@ -188,7 +199,7 @@ def comparison_sections(runs: Mapping[str, RunResult], store: EpisodeStore) -> l
         Section("Kept of each factor", picture(figures.kept_bars(reports), "bars of kept, state apart from noise")),
         Section("What was trained", _trained_body(runs)),
     ]
-    strip = figures.frame_strip(store, _evaluation_rows(store), list(store.observations))
+    strip = figures.frame_strip(store, rows_of(store, store.episodes("evaluation")), list(store.observations))
     drawn = {
         "What the encoder sees": strip,
         "What can be drawn again from the latent": _drawings(runs),
@@ -234,10 +245,6 @@ def _usage_body(runs: Mapping[str, RunResult]) -> str:
     if quantised:
         lines.append(f"codes = encoder.codes(observations)     # int64 (N, {run.report.groups})")
     return f"<pre>{html.escape(chr(10).join(lines))}</pre>"
-
-
-def _evaluation_rows(store: EpisodeStore) -> np.ndarray:
-    return np.flatnonzero(np.isin(store.row_episodes, store.episodes("evaluation")))
 
 
 def _curves(runs: Mapping[str, RunResult]) -> bytes | None:

@@ -51,7 +51,8 @@ def split_evaluation(store: EpisodeStore) -> ProbeSplit:
 
 def rows_of(store: EpisodeStore, episodes: np.ndarray) -> np.ndarray:
     """(E,) episode indices to the (n,) int64 rows they hold."""
-    return np.concatenate([np.arange(store.starts[e], store.starts[e] + store.lengths[e]) for e in episodes])
+    parts = [np.arange(store.starts[e], store.starts[e] + store.lengths[e]) for e in episodes]
+    return np.concatenate([np.empty(0, np.int64), *parts])
 
 
 def episode_folds(episodes: np.ndarray, folds: int = 4) -> list[np.ndarray]:

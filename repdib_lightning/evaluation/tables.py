@@ -76,6 +76,8 @@ def report_table(report: ProbeReport) -> str:
             rows.append(row + [""] * (report.codebook is not None))
     if report.pictures is not None:
         rows += [_picture_row(report, name) for name in report.pictures.regions]
+    blank = [""] * (len(header) - 5)
+    rows += [[f"groups: {name}", "", "", "", number(value), *blank] for name, value in _group_figures(report).items()]
     table = Table(header, rows, (first_mean,)).text()
     return "\n".join([table, "", *notes({report.name: report})])
 
@@ -116,6 +118,10 @@ def comparison_table(reports: dict[str, ProbeReport]) -> Table:
     if first.pictures is not None:
         rules.append(len(rows))
         rows += [_region_row(reports, region, probes) for region in first.pictures.regions]
+    if first.grouped is not None:
+        rules.append(len(rows))
+        figures = dict.fromkeys(name for report in reports.values() for name in _group_figures(report))
+        rows += [_group_row(reports, name, probes) for name in figures]
     rules.append(len(rows))
     rows.append(_codes_row(reports, probes))
     return Table(header, rows, tuple(r for r in rules if r))
@@ -158,6 +164,17 @@ def _region_row(reports: dict[str, ProbeReport], region: str, probes: list[str])
     return row
 
 
+def _group_figures(report: ProbeReport) -> dict[str, float | None]:
+    return {} if report.grouped is None else report.grouped.figures()
+
+
+def _group_row(reports: dict[str, ProbeReport], name: str, probes: list[str]) -> list[str]:
+    row = [f"groups: {name}", ""]
+    for report in reports.values():
+        row += [number(_group_figures(report).get(name)), *[""] * len(probes)]
+    return row
+
+
 def _codes_row(reports: dict[str, ProbeReport], probes: list[str]) -> list[str]:
     row = ["codes used per group", ""]
     for report in reports.values():
@@ -185,6 +202,17 @@ def notes(reports: dict[str, ProbeReport]) -> list[str]:
             "picture: squared error of a decoder from the latent, relative to the mean picture; kept = 1 - error, "
             "in the column of the first probe."
         )
+    if first.grouped is not None:
+        lines.append("groups: what the groups hold and draw, in the column of the first probe.")
+    for name, report in reports.items():
+        if report.grouped is not None:
+            found = report.grouped.disentanglement
+            held = ", ".join(f"group {g} {factor or 'nothing beyond chance'}" for g, factor in enumerate(found.holds))
+            lines.append(
+                f"{name}: what each of {report.grouped.groups} groups holds most: {held} (codes: "
+                f"{report.grouped.codes}; counted on {found.fit_rows + found.score_rows} rows, "
+                f"learned on {found.fit_rows} training rows)."
+            )
     for name, report in reports.items():
         use = report.codebook
         if use is not None:

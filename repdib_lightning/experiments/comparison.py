@@ -20,6 +20,7 @@ _REACHED = (
     *("mean_return", "mean_success", "final_success", "mean_coverage"),
 )
 _NEEDED = ("steps_to_solve", "moves")
+_NEITHER_OF_GROUPS = ("share", "drawn", "moved", "moved_unswapped", "psnr_lost_most", "psnr_lost_least")
 
 
 @dataclass(frozen=True)
@@ -57,10 +58,13 @@ def direction(measure: str, factors: dict[str, str]) -> Direction:
     """Whether more of a measure is better (``up``), less is (``down``), or neither.
 
     State and agent should be kept, noise and background dropped; an error is what was not kept. Of fine-tuning
-    (``AGENT/NAME/...``), what was reached should be high, what it took should be low.
+    (``AGENT/NAME/...``), what was reached should be high, what it took should be low. Groups should hold, draw and move
+    different factors; how much one of them holds or draws alone says nothing of that.
     """
     if measure.startswith("codes/"):
         return ""
+    if measure.startswith("groups/"):
+        return "" if measure.rpartition("/")[2] in _NEITHER_OF_GROUPS else "up"
     if measure.startswith("val/"):
         return "up" if measure.endswith("accuracy") else "down" if measure == "val/loss" or "/raw/" in measure else ""
     first, target, quantity = measure.split("/", 2)

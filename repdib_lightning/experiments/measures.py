@@ -48,6 +48,7 @@ def collect_measures(run: Path, probe: Path | None, outcomes: Mapping[str, Path]
     - ``PROBE/state/kept``, ``PROBE/noise/kept``: means over the factors of that kind;
     - ``decoder/background/kept``, ``.../error``, and the same for ``agent``: of the pictures
       (:mod:`repdib_lightning.evaluation.decoder`);
+    - ``groups/...``: what the groups hold and draw (:mod:`repdib_lightning.evaluation.group_probe`);
     - ``codes/used``, ``codes/perplexity``: means over the groups, on held-out episodes;
     - ``val/...``: what the last validation logged;
     - ``AGENT/NAME/...``: of each fine-tuning; what it says null of is left out.
@@ -115,6 +116,8 @@ def _probed(report: dict[str, Any]) -> dict[str, float]:
     for region, score in (report.get("pictures") or {}).get("regions", {}).items():
         for name in ("kept", "error", "rmse"):
             _add(found, f"decoder/{region}/{name}", score[name])
+    for name, value in ((report.get("grouped") or {}).get("figures") or {}).items():
+        _add(found, f"groups/{name}", value)
     if report["codebook"] is not None:
         _add(found, "codes/used", float(np.mean(report["codebook"]["used"])))
         _add(found, "codes/perplexity", float(np.mean(report["codebook"]["perplexity"])))

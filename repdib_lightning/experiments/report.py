@@ -19,6 +19,7 @@ from repdib_lightning.experiments.curve_names import check_curves
 from repdib_lightning.experiments.curves import Band, bands, finetune_bands, write_bands
 from repdib_lightning.experiments.film_part import film_parts
 from repdib_lightning.experiments.finetune_parts import finetune_parts, training_only
+from repdib_lightning.experiments.group_part import group_parts
 from repdib_lightning.experiments.headline import headline, verdicts
 from repdib_lightning.experiments.maze_maps import Maps, mean_maps, write_maps
 from repdib_lightning.experiments.overview import overview_parts
@@ -60,7 +61,7 @@ def report_suite(
     all_maps = {grid.name: mean_maps(results, grid) for grid in plan.grids}
     found = {grid.name: (summaries(results, grid), differences(results, grid)) for grid in plan.grids}
     parts = [*_headline_part(results), *_grid_parts(results, found, all_bands, all_maps), *_latent_parts(results)]
-    parts = [*overview_parts(results), *parts, *film_parts(results)]
+    parts = [*overview_parts(results), *parts, *group_parts(results), *film_parts(results)]
     _write(folder, results, parts, all_bands)
     if any(all_maps.values()):
         write_maps(folder / "maps.json", all_maps)

@@ -22,7 +22,7 @@ CONFIG = "config"
 SET_BY_SUITE = ("seed_everything", "data.seed", "data.init_args.seed", "data.path", "data.init_args.path", "run")
 """Options of ``fit`` that follow from the suite's data and seeds, so that no setting may give them."""
 
-PROBE_OPTIONS = ("probes", "device", "seed")
+PROBE_OPTIONS = ("probes", "groups", "clusters", "device", "seed")
 
 PHASES = ("fit", "export", "probe", "finetune")
 """Verbs that points go through, in this order; a setting may have only some of them."""
@@ -182,6 +182,7 @@ class Suite:
         maps: settings whose maps of mazes are shown; empty for all.
         overview: measures that the report draws over all grids, first of all.
         films: places (``grid/setting``) of the settings whose policies are shown in films.
+        drawn_groups: places of the settings of which the report shows what each group draws.
     """
 
     name: str
@@ -205,6 +206,7 @@ class Suite:
     maps: tuple[str, ...] = ()
     films: tuple[str, ...] = ()
     overview: tuple[str, ...] = ()
+    drawn_groups: tuple[str, ...] = ()
 
     def grid(self, name: str) -> Grid:
         """The grid of this name; the first one for an empty name."""

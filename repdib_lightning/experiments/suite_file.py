@@ -58,6 +58,7 @@ def read_suite(name: str | Path) -> Suite:
     built = _grids(file, tree)
     known = [setting.name for setting in built[0].settings]
     headline = tree.get("headline")
+    places = [setting.place for grid in built for setting in grid.settings]
     threads = tree.get("threads", 1)
     if type(threads) is not int or threads < 1:
         raise UserError(f"{file}: threads must be at least 1, is {threads!r}")
@@ -81,7 +82,8 @@ def read_suite(name: str | Path) -> Suite:
         show=_show(file, words(file, "show", tree.get("show", []), known), built[0]),
         colours=words(file, "colours", tree.get("colours", [])),
         finetune_curves=words(file, "finetune_curves", tree.get("finetune_curves", ["eval/success"])),
-        films=words(file, "films", tree.get("films", []), [s.place for grid in built for s in grid.settings]),
+        films=words(file, "films", tree.get("films", []), places),
+        drawn_groups=words(file, "drawn_groups", tree.get("drawn_groups", []), places),
         maps=words(file, "maps", tree.get("maps", []), [s.name for grid in built for s in grid.settings]),
     )
     check_measures(suite)

@@ -1,30 +1,44 @@
-"""Checks the names of measures in a suite's file, as far as they are known before anything ran."""
+"""Checks probes and names of measures in a suite's file, as far as they are known before anything ran."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.experiments.merging import REPLACED
 from repdib_lightning.experiments.suite import Grid, Suite
 from repdib_lightning.word_lists import words
 
-FACTOR_PROBES, PICTURE_PROBE = ("linear", "mlp"), "decoder"
+FACTOR_PROBES, PICTURE_PROBE, GROUP_PROBE = ("linear", "mlp"), "decoder", "groups"
 """What ``probe --probes`` takes; written out, since the probes themselves import torch."""
 
 QUANTITIES = {**dict.fromkeys(FACTOR_PROBES, ("kept", "error")), PICTURE_PROBE: ("kept", "error", "rmse")}
 """Probe -> last part of its measures."""
 
+GROUP_SCORES = (
+    *("modularity", "compactness", "explicitness", "mig", "held"),
+    *("dci_disentanglement", "dci_completeness", "dci_informativeness"),
+    *("psnr", "psnr_gain", "psnr_lost_most", "psnr_lost_least"),
+)
+GROUP_FACTOR_SCORES = ("share", "share_gap", "explicitness", "judged", "drawn", "moved", "moved_gap", "moved_unswapped")
+"""What the probe ``groups`` measures of a latent, and of each factor."""
+
+QUANTISERS = ("VectorQuantiser", "RepDIB")
+"""Bottlenecks that take ``groups``; written out, since they import torch."""
+
 
 def check_measures(suite: Suite) -> None:
-    """Check ``measures``, ``claims`` and ``headline``: their probes, agents and names of fine-tunings.
+    """Check ``probe``, and probes, agents and names of fine-tunings in ``measures``, ``claims`` and ``headline``.
 
     Factors, logged values and what an agent measures show only when there are results.
 
     Raises:
-        UserError: naming file, key and the nearest name.
+        UserError: naming file, key and the nearest name, or the setting that has other groups than its probe.
     """
     _check_probes(suite)
     _check_shared_probes(suite)
+    _check_groups(suite)
     for measure in suite.measures:
         _check(suite, "measures", measure, suite.grids)
     for measure in suite.overview:
@@ -42,7 +56,7 @@ def probes_of(suite: Suite, grid: Grid) -> tuple[str, ...]:
 
 
 def _check_probes(suite: Suite) -> None:
-    known = (*FACTOR_PROBES, PICTURE_PROBE)
+    known = (*FACTOR_PROBES, PICTURE_PROBE, GROUP_PROBE)
     for grid in suite.grids:
         chosen = probes_of(suite, grid)
         where = f"{suite.file}: " + ("probe.probes" if grid.probe is None else f"grids.{grid.name}.probe.probes")
@@ -66,6 +80,32 @@ def _check_shared_probes(suite: Suite) -> None:
                 )
 
 
+def _check_groups(suite: Suite) -> None:
+    """A quantised latent cannot be cut into other groups than its own; the probe would say so after training."""
+    for grid in suite.grids:
+        probe, key = (suite.probe, "probe") if grid.probe is None else (grid.probe, f"grids.{grid.name}.probe")
+        wanted = probe.get("groups")
+        for setting in grid.settings:
+            own = _groups_of(_under(setting.merged.get("model"), "bottleneck"))
+            if None not in (wanted, own) and str(wanted) != str(own):
+                raise UserError(
+                    f"{suite.file}: {key}.groups is {wanted}, but '{setting.place}' quantises {own} groups; set {own}, "
+                    f"or leave it out, in a 'probe' of a grid of its own"
+                )
+
+
+def _groups_of(bottleneck: Any) -> Any:
+    """``groups`` of a bottleneck's block, as far as files and options say it; None where they do not."""
+    given = _under(_under(bottleneck, "init_args"), "groups")
+    if given is None and str(_under(bottleneck, "class_path")).rpartition(".")[2] in QUANTISERS:
+        return _groups_of(_under(bottleneck, REPLACED))  # the parser takes over what the new class has too
+    return given
+
+
+def _under(block: Any, key: str) -> Any:
+    return block.get(key) if isinstance(block, Mapping) else None
+
+
 def _check(suite: Suite, key: str, measure: str, grids: Sequence[Grid]) -> None:
     first, _, rest = str(measure).partition("/")
     settings = [setting for grid in grids for setting in grid.settings]
@@ -83,5 +123,9 @@ def _check(suite: Suite, key: str, measure: str, grids: Sequence[Grid]) -> None:
     if runs and not of_run:
         raise UserError(f"{where}: does not say what of the fine-tuning, such as {first}/{name}/mean_return")
     last = rest.rpartition("/")[2]
+    if first == GROUP_PROBE:
+        kind, known_last = ("of a factor ", GROUP_FACTOR_SCORES) if "/" in rest else ("", GROUP_SCORES)
+        if last not in known_last:
+            raise UserError(f"{where}: '{last}' {kind}is not measured, {nearest(last, known_last)}")
     if first in QUANTITIES and last not in QUANTITIES[first]:
         raise UserError(f"{where}: must end in {' or '.join(QUANTITIES[first])}, {nearest(last, QUANTITIES[first])}")

@@ -17,11 +17,12 @@ from torch import Tensor, nn
 from repdib_lightning.bottlenecks.base import Bottleneck
 from repdib_lightning.bottlenecks.vector_quantiser import VectorQuantiser
 from repdib_lightning.data.files import sync_directory, sync_file
+from repdib_lightning.decoders import Decoder
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError
-from repdib_lightning.export.description import CONFIG, WEIGHTS, as_text, bundle_config, sealed
+from repdib_lightning.export.description import CONFIG, DECODER_WEIGHTS, WEIGHTS, as_text, bundle_config, sealed
 from repdib_lightning.export.formats import check_formats, write_format
-from repdib_lightning.export.load import load_encoder
+from repdib_lightning.export.load import load_decoder, load_encoder
 from repdib_lightning.word_lists import words
 
 
@@ -32,6 +33,7 @@ def save_bundle(
     *,
     training: Mapping[str, Any],
     data: Mapping[str, Any],
+    decoder: Decoder | None = None,
     overwrite: bool = False,
     formats: str | Sequence[str] = "safetensors",
 ) -> Path:
@@ -43,6 +45,7 @@ def save_bundle(
         bottleneck: trained; its class must be in ``bottlenecks.BOTTLENECKS``.
         training: plain facts of the run (objective, steps, run).
         data: plain facts of the data (file, fingerprint); folders of absolute paths are left out.
+        decoder: trained, of the latents of both; its class must be in ``decoders.DECODERS``.
         overwrite: replace an existing bundle (never a folder that holds anything else).
         formats: ``safetensors`` (always written), ``pt2`` (torch.export), ``onnx``; several between commas.
 
@@ -57,34 +60,40 @@ def save_bundle(
     _check_target(target, overwrite)
     chosen = words(formats, "formats")
     check_formats(chosen)
-    _check_trained(encoder, bottleneck)
-    config = bundle_config(encoder, bottleneck, training, data)
-    content = tensors_to_bytes(_weights(encoder, bottleneck))
+    modules: dict[str, nn.Module] = {"encoder": encoder, "bottleneck": bottleneck}
+    _check_trained([*modules.values(), *([] if decoder is None else [decoder])])
+    config = bundle_config(encoder, bottleneck, training, data, decoder)
+    content = tensors_to_bytes(_weights(nn.ModuleDict(modules)))
     with _whole_folder(target) as aside:
-        _write(aside, content, config, {})
+        drawing = []
+        if decoder is not None:
+            (aside / DECODER_WEIGHTS).write_bytes(tensors_to_bytes(_weights(decoder)))
+            drawing = [DECODER_WEIGHTS]
+        _write(aside, content, config, drawing)
         frozen = load_encoder(aside)
+        if decoder is not None:
+            load_decoder(aside)
         written = [name for form in chosen for name in write_format(form, frozen, aside)]
-        _write(aside, content, config, {name: _sha256(aside / name) for name in written})
+        _write(aside, content, config, [*drawing, *written])
     return target
 
 
-def _write(aside: Path, content: bytes, config: Mapping[str, Any], more: Mapping[str, str]) -> None:
+def _write(aside: Path, content: bytes, config: Mapping[str, Any], more: Sequence[str]) -> None:
     (aside / WEIGHTS).write_bytes(content)
-    files = {WEIGHTS: hashlib.sha256(content).hexdigest(), **more}
+    files = {WEIGHTS: hashlib.sha256(content).hexdigest(), **{name: _sha256(aside / name) for name in more}}
     (aside / CONFIG).write_text(as_text(sealed({**config, "files": files})))
 
 
-def _weights(encoder: Encoder, bottleneck: Bottleneck) -> dict[str, Tensor]:
-    modules = nn.ModuleDict({"encoder": encoder, "bottleneck": bottleneck})
+def _weights(module: nn.Module) -> dict[str, Tensor]:
     # Cloned, since safetensors refuses tensors that share memory.
-    return {name: value.detach().cpu().contiguous().clone() for name, value in modules.state_dict().items()}
+    return {name: value.detach().cpu().contiguous().clone() for name, value in module.state_dict().items()}
 
 
-def _check_trained(encoder: Encoder, bottleneck: Bottleneck) -> None:
-    for module in (*encoder.modules(), *bottleneck.modules()):
+def _check_trained(parts: Sequence[nn.Module]) -> None:
+    for module in (module for part in parts for module in part.modules()):
         if isinstance(module, VectorQuantiser):
             module.require_ready()
-    for part in (encoder, bottleneck):
+    for part in parts:
         for name, parameter in part.named_parameters():
             if not bool(torch.isfinite(parameter).all()):
                 raise UserError(f"{type(part).__name__}: parameter '{name}' is not finite (NaN or infinite)")

@@ -4,6 +4,7 @@
 
     format, schema_version       repdib_bundle, 1
     encoder, bottleneck          {class: a name of the allow-list, arguments: plain values}
+    decoder                      the same, where the objective drew pictures (absent otherwise)
     spec                         observations (name -> shape, dtype), actions, frame_stack, horizon
     preprocessing                what the caller does to its observations: nothing but stack frames
     features, groups, codes      M, G, L (G = L = 0 where nothing is quantised)
@@ -25,14 +26,15 @@ import torch
 from torch import nn
 
 import repdib_lightning
-from repdib_lightning import bottlenecks, encoders
-from repdib_lightning.bottlenecks.base import Bottleneck
+from repdib_lightning import bottlenecks, decoders, encoders
+from repdib_lightning.bottlenecks import Bottleneck, PerPosition
+from repdib_lightning.decoders import Decoder
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError
 
 FORMAT = "repdib_bundle"
 SCHEMA_VERSION = 1
-CONFIG, WEIGHTS = "config.json", "model.safetensors"
+CONFIG, WEIGHTS, DECODER_WEIGHTS = "config.json", "model.safetensors", "model.decoder.safetensors"
 
 MODEL_DESCRIPTION = "bundle.json"
 """The file of a run folder that says how to rebuild its encoder and bottleneck."""
@@ -47,7 +49,11 @@ PREPROCESSING: dict[str, str] = {
 
 
 def bundle_config(
-    encoder: Encoder, bottleneck: Bottleneck, training: Mapping[str, Any], data: Mapping[str, Any]
+    encoder: Encoder,
+    bottleneck: Bottleneck,
+    training: Mapping[str, Any],
+    data: Mapping[str, Any],
+    decoder: Decoder | None = None,
 ) -> dict[str, Any]:
     """Describe the two modules so that they can be rebuilt.
 
@@ -56,6 +62,7 @@ def bundle_config(
         bottleneck: an instance of a class in ``bottlenecks.BOTTLENECKS``.
         training: plain facts of the run, e.g. objective, steps, run.
         data: plain facts of the data, e.g. file, fingerprint. Folders of absolute paths are left out.
+        decoder: an instance of a class in ``decoders.DECODERS``, or None.
 
     Returns:
         Everything of the module docstring but ``files`` and ``digest``.
@@ -63,11 +70,15 @@ def bundle_config(
     Raises:
         UserError: a class outside the allow-lists, or a value that JSON cannot hold.
     """
+    # One bottleneck serves all positions of a grid, of which the encoder tells.
+    inner = bottleneck.inner if isinstance(bottleneck, PerPosition) else bottleneck
+    drawing = {} if decoder is None else {"decoder": _described(decoder, decoders.DECODERS, "DECODERS")}
     return {
         "format": FORMAT,
         "schema_version": SCHEMA_VERSION,
         "encoder": _described(encoder, encoders.ENCODERS, "ENCODERS"),
-        "bottleneck": _described(bottleneck, bottlenecks.BOTTLENECKS, "BOTTLENECKS"),
+        "bottleneck": _described(inner, bottlenecks.BOTTLENECKS, "BOTTLENECKS"),
+        **drawing,
         "spec": encoder.spec.to_dict(),
         "preprocessing": PREPROCESSING,
         "features": encoder.features,

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as read_tensors
+from torch import nn
 
+from repdib_lightning.decoders import Decoder
 from repdib_lightning.errors import UserError
-from repdib_lightning.export.description import CONFIG, MODEL_DESCRIPTION, WEIGHTS
+from repdib_lightning.export.description import CONFIG, DECODER_WEIGHTS, MODEL_DESCRIPTION, WEIGHTS
 from repdib_lightning.export.frozen import FrozenEncoder
-from repdib_lightning.export.rebuild import fill, read_description, rebuild
+from repdib_lightning.export.rebuild import fill, read_description, rebuild, rebuild_decoder
+
+Module = TypeVar("Module", bound=nn.Module)
 
 
 def load_encoder(path: str | Path, device: str | torch.device = "cpu") -> FrozenEncoder:
@@ -26,22 +32,46 @@ def load_encoder(path: str | Path, device: str | torch.device = "cpu") -> Frozen
         UserError: no such bundle or device; a run in place of its bundle; a file that is missing, damaged, newer than
             this package, or names classes, arguments or tensors that do not exist here. One line, naming file and key.
     """
-    folder = Path(path)
+    config = _description_of(Path(path))
+    frozen = FrozenEncoder(*rebuild(Path(path) / CONFIG, config), config)
+    return _filled(frozen, Path(path), WEIGHTS, config, device)
+
+
+def load_decoder(path: str | Path, device: str | torch.device = "cpu") -> Decoder:
+    """Load the decoder of a bundle whose objective drew pictures, frozen, in evaluation mode.
+
+    Args:
+        path: the bundle's folder.
+        device: where to put it.
+
+    Raises:
+        UserError: as :func:`load_encoder`; or a bundle without a decoder.
+    """
+    config = _description_of(Path(path))
+    encoder, _ = rebuild(Path(path) / CONFIG, config)
+    decoder = rebuild_decoder(Path(path) / CONFIG, config, encoder).requires_grad_(False).eval()
+    return _filled(decoder, Path(path), DECODER_WEIGHTS, config, device)
+
+
+def _description_of(folder: Path) -> dict[str, Any]:
     if not folder.is_dir():
         what = "is a file, a bundle is a folder" if folder.exists() else "no such bundle"
         raise UserError(f"{folder}: {what} with {CONFIG} and {WEIGHTS}")
     _refuse_run(folder)
-    config = read_description(folder / CONFIG)
-    weights = folder / WEIGHTS
+    return read_description(folder / CONFIG)
+
+
+def _filled(module: Module, folder: Path, name: str, config: Mapping[str, Any], device: str | torch.device) -> Module:
+    """The module with the weights of one file, on a device."""
+    weights = folder / name
     content = _verified_bytes(weights, config.get("files"), folder / CONFIG)
-    frozen = FrozenEncoder(*rebuild(folder / CONFIG, config), config)
     try:
         tensors = read_tensors(content)
     except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
         raise UserError(f"{weights}: not a readable safetensors file ({str(error).splitlines()[0]})") from error
-    fill(weights, frozen, tensors, CONFIG)
+    fill(weights, module, tensors, CONFIG)
     try:
-        return frozen.to(device)
+        return module.to(device)
     except (RuntimeError, AssertionError) as error:
         raise UserError(f"device '{device}' cannot be used ({str(error).splitlines()[0]})") from error
 
@@ -57,9 +87,9 @@ def _refuse_run(folder: Path) -> None:
 
 def _verified_bytes(path: Path, files: object, described: Path) -> bytes:
     """The file's content, hashed and later parsed from the same bytes, so that nothing can change in between."""
-    expected = files.get(WEIGHTS) if isinstance(files, dict) else None
+    expected = files.get(path.name) if isinstance(files, dict) else None
     if expected is None:
-        raise UserError(f"{described}: key 'files.{WEIGHTS}' is missing")
+        raise UserError(f"{described}: key 'files.{path.name}' is missing")
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -67,5 +97,5 @@ def _verified_bytes(path: Path, files: object, described: Path) -> bytes:
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from error
     if hashlib.sha256(content).hexdigest() != expected:
-        raise UserError(f"{path}: content does not match 'files.{WEIGHTS}' of {CONFIG} (damaged or replaced)")
+        raise UserError(f"{path}: content does not match 'files.{path.name}' of {CONFIG} (damaged or replaced)")
     return content

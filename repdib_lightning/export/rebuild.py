@@ -11,8 +11,9 @@ from typing import Any, NoReturn, TypeVar
 import torch
 from torch import Tensor, nn
 
-from repdib_lightning import bottlenecks, encoders
-from repdib_lightning.bottlenecks.base import Bottleneck
+from repdib_lightning import bottlenecks, decoders, encoders
+from repdib_lightning.bottlenecks import Bottleneck, for_positions
+from repdib_lightning.decoders import Decoder
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.export.description import FORMAT, PREPROCESSING, SCHEMA_VERSION, digest
@@ -78,12 +79,29 @@ def rebuild(path: Path, config: Mapping[str, Any]) -> tuple[Encoder, Bottleneck]
     spec = _spec(path, config["spec"])
     with torch.random.fork_rng(devices=[]):
         encoder = _build(path, "encoder", config, encoders.ENCODERS, spec)
-        bottleneck = _build(path, "bottleneck", config, bottlenecks.BOTTLENECKS, encoder.features)
+        bottleneck = for_positions(
+            lambda width: _build(path, "bottleneck", config, bottlenecks.BOTTLENECKS, width),
+            encoder.features,
+            encoder.positions,
+        )
     built = {"features": encoder.features, "groups": bottleneck.groups, "codes": bottleneck.codes}
     for key, size in built.items():
         if config[key] != size:
             raise UserError(f"{path}: '{key}' is {config[key]}, the modules it describes have {size}")
     return encoder, bottleneck
+
+
+def rebuild_decoder(path: Path, config: Mapping[str, Any], encoder: Encoder) -> Decoder:
+    """Build the decoder of a description (untrained), leaving torch's random state as it was.
+
+    Raises:
+        UserError: as :func:`rebuild`; or a description without a decoder.
+    """
+    if "decoder" not in config:
+        raise UserError(f"{path}: has no decoder; only an objective that draws pictures (Reconstruction) exports one")
+    _value(path, config, "decoder", dict)
+    with torch.random.fork_rng(devices=[]):
+        return _build(path, "decoder", config, decoders.DECODERS, encoder.spec, encoder.features)
 
 
 def fill(path: Path, module: nn.Module, tensors: Mapping[str, Tensor], described: str) -> None:
@@ -123,19 +141,19 @@ def _misfit(module: nn.Module, tensors: Mapping[str, Tensor], described: str) ->
     return ""
 
 
-def _build(path: Path, key: str, config: Mapping[str, Any], allowed: Mapping[str, type[Part]], first: Any) -> Part:
+def _build(path: Path, key: str, config: Mapping[str, Any], allowed: Mapping[str, type[Part]], *first: Any) -> Part:
     name = _value(path, config[key], "class", str, f"{key}.")
     arguments = _value(path, config[key], "arguments", dict, f"{key}.")
     if name not in allowed:
         raise UserError(f"{path}: '{key}.class' is unknown: '{name}', {nearest(name, allowed)}")
-    taken = list(inspect.signature(allowed[name]).parameters)[1:]
+    taken = list(inspect.signature(allowed[name]).parameters)[len(first) :]
     for argument in arguments:
         if argument not in taken:
             raise UserError(
                 f"{path}: '{key}.arguments' has '{argument}', unknown to {name}; {nearest(argument, taken)}"
             )
     try:
-        return allowed[name](first, **arguments)
+        return allowed[name](*first, **arguments)
     # Values of a wrong type fail in ways that only the class knows; all of them are the file's fault.
     except Exception as error:
         raise UserError(f"{path}: '{key}.arguments' do not build a {name}: {_first_line(error)}") from error
@@ -155,9 +173,9 @@ def _spec(path: Path, plain: Mapping[str, Any]) -> DataSpec:
         observations[name] = ArraySpec(tuple(shape), dtype)
     if not observations:
         raise UserError(f"{path}: 'spec.observations' is empty")
-    for count in ("frame_stack", "horizon"):
-        if not _is_count(_value(path, plain, count, int, "spec.")):
-            raise UserError(f"{path}: 'spec.{count}' must be at least 1, is {plain[count]!r:.60}")
+    for count, least in (("frame_stack", 1), ("horizon", 0)):
+        if _value(path, plain, count, int, "spec.") < least:
+            raise UserError(f"{path}: 'spec.{count}' must be at least {least}, is {plain[count]!r:.60}")
     actions = plain.get("actions")
     if actions is not None:
         described = isinstance(actions, dict) and set(actions) == {"kind", "size"} and _is_count(actions["size"])

@@ -11,11 +11,12 @@ from torch import Tensor, nn
 
 from repdib_lightning.bottlenecks.base import Bottleneck
 from repdib_lightning.data.files import whole_file
+from repdib_lightning.decoders import Decoder
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError
 from repdib_lightning.export.bundle import save_bundle
 from repdib_lightning.export.description import MODEL_DESCRIPTION, as_text, bundle_config, sealed
-from repdib_lightning.export.rebuild import fill, read_description, rebuild
+from repdib_lightning.export.rebuild import fill, read_description, rebuild, rebuild_decoder
 from repdib_lightning.word_lists import words
 
 
@@ -26,6 +27,7 @@ def write_model_description(
     *,
     training: Mapping[str, Any],
     data: Mapping[str, Any],
+    drawing: tuple[str, Decoder] | None = None,
 ) -> Path:
     """Write ``bundle.json``, once the modules are built, so that any later checkpoint of the run can be exported.
 
@@ -35,6 +37,7 @@ def write_model_description(
         bottleneck: as built, trained or not.
         training: plain facts (objective, run); the steps are added at export.
         data: plain facts (file, fingerprint).
+        drawing: name of the decoder among the modules of the objective, and the decoder; None without one.
 
     Returns:
         The file.
@@ -43,7 +46,10 @@ def write_model_description(
         UserError: it cannot be written, or holds what a bundle cannot.
     """
     path = Path(run_folder) / MODEL_DESCRIPTION
-    text = as_text(sealed(bundle_config(encoder, bottleneck, training, data)))
+    config = bundle_config(encoder, bottleneck, training, data, None if drawing is None else drawing[1])
+    if drawing is not None:
+        config["decoder"]["module"] = f"objective.{drawing[0]}"
+    text = as_text(sealed(config))
     with whole_file(path) as temporary:
         temporary.write_text(text)
     return path
@@ -80,8 +86,11 @@ def export_run(
     encoder, bottleneck = rebuild(path, config)
     checkpoint_file = _newest_checkpoint(run)
     checkpoint = torch.load(checkpoint_file, map_location="cpu", weights_only=True)
+    decoder = rebuild_decoder(path, config, encoder) if "decoder" in config else None
     modules = nn.ModuleDict({"encoder": encoder, "bottleneck": bottleneck})
     fill(checkpoint_file, modules, _parts(checkpoint, modules), path.name)
+    if decoder is not None:
+        fill(checkpoint_file, decoder, _parts(checkpoint, decoder, f"{config['decoder'].get('module')}."), path.name)
     training = {"run": run.resolve().name, **config["training"], "steps": int(checkpoint["global_step"])}
     folder = run / "bundle" if output is None else Path(output)
     return save_bundle(
@@ -90,6 +99,7 @@ def export_run(
         bottleneck.eval(),
         training=training,
         data=config["data"],
+        decoder=None if decoder is None else decoder.eval(),
         overwrite=overwrite,
         formats=words(formats, "formats"),
     )
@@ -108,13 +118,14 @@ def _newest_checkpoint(run: Path) -> Path:
         raise UserError(f"{run}: all its checkpoints are damaged: nothing to export") from error
 
 
-def _parts(checkpoint: Mapping[str, Any], modules: nn.Module) -> dict[str, Tensor]:
-    """The weights of encoder and bottleneck; the objective's and the optimiser's stay behind.
+def _parts(checkpoint: Mapping[str, Any], module: nn.Module, prefix: str = "") -> dict[str, Tensor]:
+    """The weights of a module under its prefix (none: encoder and bottleneck); all else stays behind.
 
     A run in bf16-true or 64-true leaves weights of that precision; they become the modules' own, float32.
     """
-    prefixes, expected = ("encoder.", "bottleneck."), modules.state_dict()
-    parts = {name: value for name, value in checkpoint["state_dict"].items() if name.startswith(prefixes)}
+    expected, prefixes = module.state_dict(), (prefix,) if prefix else ("encoder.", "bottleneck.")
+    saved = checkpoint["state_dict"].items()
+    parts = {name.removeprefix(prefix): value for name, value in saved if name.startswith(prefixes)}
     for name, value in parts.items():
         if name in expected and value.is_floating_point() and expected[name].is_floating_point():
             parts[name] = value.to(expected[name].dtype)

@@ -7,11 +7,21 @@ from repdib_lightning.objectives.emi import EMI
 from repdib_lightning.objectives.forward_prediction import ForwardPrediction
 from repdib_lightning.objectives.info_nce import InfoNCE
 from repdib_lightning.objectives.inverse_dynamics import InverseDynamics
+from repdib_lightning.objectives.reconstruction import Reconstruction
 from repdib_lightning.objectives.several import SeveralObjectives
 
 OBJECTIVES: dict[str, type[Objective]] = {
     cls.__name__: cls
-    for cls in (InverseDynamics, DRIML, InfoNCE, ForwardPrediction, EMI, DynamicBottleneck, SeveralObjectives)
+    for cls in (
+        InverseDynamics,
+        DRIML,
+        InfoNCE,
+        ForwardPrediction,
+        EMI,
+        DynamicBottleneck,
+        Reconstruction,
+        SeveralObjectives,
+    )
 }
 """The objectives by name."""
 
@@ -25,5 +35,6 @@ __all__ = [
     "InfoNCE",
     "InverseDynamics",
     "Objective",
+    "Reconstruction",
     "SeveralObjectives",
 ]

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from repdib_lightning.decoders import Decoder
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import ActionSpec, Batch, DataSpec, ObjectiveOutput
 
@@ -27,6 +28,10 @@ class Objective(nn.Module):
         """What a bundle says its encoder was trained with."""
         return type(self).__name__
 
+    def find_decoder(self) -> tuple[str, Decoder] | None:
+        """The decoder among its modules, and its name there; exported with the encoder. None if it draws nothing."""
+        return next(((name, part) for name, part in self.named_modules() if isinstance(part, Decoder)), None)
+
     def forward(self, batch: Batch, encode: Encode) -> ObjectiveOutput:
         """Encode what is needed with one call of ``encode``, and return unweighted losses."""
         raise NotImplementedError
@@ -42,6 +47,17 @@ def drawn(batch: Batch, latents: Tensor, spec: DataSpec) -> tuple[Tensor, Tensor
     """
     first = 2 if spec.next_frame else 1
     return latents[:, first:], batch.offsets[:, first:]
+
+
+def require_futures(name: str, spec: DataSpec) -> None:
+    """Raise UserError where samples are drawn without futures.
+
+    Args:
+        name: of the objective, for the message.
+        spec: of the data.
+    """
+    if spec.horizon < 1:
+        raise UserError(f"{name}: compares frames with later ones; set data.futures to at least 1")
 
 
 def next_latents(latents: Tensor, spec: DataSpec) -> Tensor:
@@ -62,7 +78,7 @@ def require_transitions(name: str, spec: DataSpec) -> ActionSpec:
     """
     if spec.actions is None:
         raise UserError(f"{name}: follows actions to the next frame, but the data has none ('actions' is missing)")
-    if not spec.next_frame and spec.horizon > 1:
+    if not spec.next_frame and spec.horizon != 1:
         raise UserError(f"{name}: needs the frame after the anchor in every sample; set data.next_frame to true")
     return spec.actions
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from repdib_lightning.bottlenecks.precision import at_least_single, without_autocast
-from repdib_lightning.objectives.base import Encode, Objective, drawn, require_several
+from repdib_lightning.objectives.base import Encode, Objective, drawn, require_futures, require_several
 from repdib_lightning.processes import gather_with_gradients
 from repdib_lightning.records import Batch, DataSpec, ObjectiveOutput
 
@@ -35,10 +35,14 @@ class TemporalContrast(Objective):
 
     Args:
         spec: which frames of a sample are drawn futures.
+
+    Raises:
+        UserError: samples without futures.
     """
 
     def __init__(self, spec: DataSpec) -> None:
         super().__init__()
+        require_futures(type(self).__name__, spec)
         self.spec = spec
 
     def describe_anchors(self, latents: Tensor, actions: Tensor | None) -> Tensor:

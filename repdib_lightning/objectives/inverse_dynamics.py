@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from repdib_lightning.errors import UserError, nearest
-from repdib_lightning.objectives.base import Encode, Objective, drawn
+from repdib_lightning.objectives.base import Encode, Objective, drawn, require_futures
 from repdib_lightning.records import Batch, DataSpec, ObjectiveOutput
 
 
@@ -27,7 +27,7 @@ class InverseDynamics(Objective):
             vectors (ACRO, Islam et al. 2022). Discrete actions always use the cross-entropy.
 
     Raises:
-        UserError: data without actions, or an unknown ``action_loss``.
+        UserError: data without actions, samples without futures, or an unknown ``action_loss``.
     """
 
     needs_actions = True
@@ -44,6 +44,7 @@ class InverseDynamics(Objective):
         super().__init__()
         if spec.actions is None:
             raise UserError("InverseDynamics: predicts actions, but the data has none ('actions' is missing)")
+        require_futures("InverseDynamics", spec)
         if action_loss not in ("squared", "cosine"):
             raise UserError(
                 f"InverseDynamics: unknown action_loss '{action_loss}', {nearest(action_loss, ('squared', 'cosine'))}"

@@ -18,6 +18,7 @@ from killing import command_in_processes
 from repdib_lightning.__main__ import VERBS, main
 from repdib_lightning.configurations import packaged, packaged_suites
 from repdib_lightning.environments.collect_control import collect_control
+from repdib_lightning.environments.collect_emoji_styles import collect_emoji_styles
 from repdib_lightning.environments.collect_maze import collect_maze
 from repdib_lightning.environments.collect_robot_arm import collect_robot_arm
 from repdib_lightning.experiments.suite_file import read_suite
@@ -50,29 +51,49 @@ def control_recording(tmp_path_factory):
     return collect_control(path, samples=200, workers=1, progress=False, **chosen)
 
 
+@pytest.fixture(scope="session")
+def drawings(tmp_path_factory):
+    """Drawings at the real size, some of the styles and species."""
+    folder = tmp_path_factory.mktemp("drawings")
+    for style in ("noto", "twemoji"):
+        (folder / "few" / style).mkdir(parents=True)
+        for file in sorted((ROOT / "data/emoji_styles" / style).glob("*.png"))[:20]:
+            shutil.copy(file, folder / "few" / style)
+    for name, size in (("emoji_styles", 64), ("pacs_elephants", 224)):
+        collect_emoji_styles(folder / f"{name}.h5", source=folder / "few", size=size, progress=False)
+    return folder
+
+
 @pytest.fixture
-def here(tmp_path, monkeypatch, recording, maze_recording, control_recording):
+def here(tmp_path, monkeypatch, recording, maze_recording, control_recording, drawings):
     monkeypatch.chdir(tmp_path)
     Path("data").mkdir()
     for name in ("walker_walk_video", "walker_walk_demo", "vd4rl_walker_walk_video"):
         shutil.copy(control_recording, f"data/{name}.h5")
     shutil.copy(maze_recording, "data/gridworld.h5")
+    for name in ("emoji_styles", "pacs_elephants"):
+        shutil.copy(drawings / f"{name}.h5", "data")
     shutil.copy(recording, "data/robot_arm.h5")
     shutil.copy(recording, "data/robot_arm_demo.h5")
     return tmp_path
 
 
 PAPER = "paper/vd4rl/multi_step_inverse"
-BASES = ("robot_arm", "mazes", "control", PAPER)
+BASES = ("robot_arm", "mazes", "control", "factors", PAPER)
 """Configurations of a whole run; the others are laid over one of them."""
 
 OVERLAYS = [name for name in packaged() if name not in BASES]
 ANYWHERE = [name for name in OVERLAYS if name.startswith(("bottleneck/", "objective/"))]
+ANYWHERE_DRAWN = [f"bottleneck/{name}" for name in ("none", "vib", "vq", "repdib", "svib")]
+"""What fits pictures without actions."""
+
 LAYERS = [
     *([base] for base in BASES),
     *(["robot_arm", name] for name in [*ANYWHERE, "debug", "demo"]),
     *(["mazes", name] for name in ANYWHERE),
     *(["control", name] for name in [*ANYWHERE, "demo_control"]),
+    *(["factors", name] for name in [*ANYWHERE_DRAWN, "factors_grid"]),
+    ["factors", "paper/pacs"],
     *([PAPER, name] for name in OVERLAYS if name.startswith("paper/vd4rl/")),
 ]
 ON_A_CPU = ["--trainer.accelerator", "cpu", "--trainer.precision", "32-true"]

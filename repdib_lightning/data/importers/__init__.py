@@ -9,5 +9,6 @@ from __future__ import annotations
 IMPORTERS: dict[str, str] = {
     "vd4rl": "repdib_lightning.data.importers.vd4rl:import_vd4rl",
     "images": "repdib_lightning.data.importers.image_folder:import_images",
+    "pacs": "repdib_lightning.data.importers.pacs:import_pacs",
     "store": "repdib_lightning.data.importers.repack:import_store",
 }

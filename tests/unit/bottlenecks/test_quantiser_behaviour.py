@@ -266,6 +266,20 @@ def test_bypass_shows_the_objective_some_rows_unquantised():
     assert not (quantiser.eval()(latent).latent == latent).all(-1).any()
 
 
+def test_dropped_groups_are_zeros_that_learn_nothing():
+    torch.manual_seed(0)
+    quantiser = started(group_dropout=0.25)
+    latent = torch.randn(3000, M, requires_grad=True)
+    output = quantiser(latent)
+    dropped = (output.latent.reshape(3000, G, -1) == 0).all(-1)
+    assert dropped.float().mean(0).tolist() == pytest.approx([0.25] * G, abs=0.04)
+    both = (dropped[:, 0] & dropped[:, 1]).float().mean().item()
+    assert both == pytest.approx(0.25**2, abs=0.02)  # each group on its own
+    output.latent.sum().backward()
+    assert torch.equal(latent.grad.reshape(3000, G, -1).eq(0).all(-1), dropped)
+    assert not (quantiser.eval()(latent).latent.reshape(3000, G, -1) == 0).all(-1).any()
+
+
 def test_metrics_count_the_codes_in_use():
     quantiser = started(groups=1, codes=4).eval()
     quantiser.book.vectors.copy_(torch.eye(4, M).unsqueeze(0))
@@ -431,6 +445,7 @@ def test_extreme_shapes_with_one_row(rule, options, start):
         ({"start_step": -1}, "start_step must be at least 0"),
         ({"revive_after": -1}, "revive_after must be at least 0"),
         ({"bypass": 1.5}, r"bypass must be in \[0, 1\], is 1.5"),
+        ({"group_dropout": 1.0}, r"group_dropout must be in \[0, 1\), is 1.0"),
     ],
 )
 def test_mistakes_are_named(options, message):

@@ -31,7 +31,7 @@ def test_options_are_those_of_the_two_parts_with_their_defaults():
 def test_every_option_reaches_its_part():
     given = {"kl_reduction": "sum", "head": "split", "log_variance_start": -3.0, "shared": True, "decay": 0.5}
     given |= {"log_variance_low": -9.0, "log_variance_high": 1.0, "codebook": "ema", "start": "random"}
-    given |= {"groups": 4, "codes": 7, "start_step": 0, "revive_after": 3, "bypass": 0.25}
+    given |= {"groups": 4, "codes": 7, "start_step": 0, "revive_after": 3, "bypass": 0.25, "group_dropout": 0.125}
     whole = RepDIB(M, **given)
     parts = whole.variational.arguments | whole.quantiser.arguments
     assert parts == given
@@ -173,3 +173,8 @@ def test_import_needs_no_lightning():
     code = "import sys, repdib_lightning.bottlenecks; print('lightning' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "False"
+
+
+def test_noise_after_the_quantiser_and_dropped_groups_exclude_each_other():
+    with pytest.raises(UserError, match="fills the groups that group_dropout empties"):
+        RepDIB(8, groups=2, noise="after", group_dropout=0.5)

@@ -80,6 +80,8 @@ def test_a_run_that_two_grids_share_is_reported_in_both(results):
         ("decoder/background/kept", "down"), ("decoder/background/error", "up"), ("decoder/agent/kept", "up"),
         ("decoder/picture/kept", ""), ("codes/used", ""), ("val/loss", "down"), ("val/action_accuracy", "up"),
         ("val/raw/inverse", "down"), ("val/kl_nats", ""),
+        ("groups/modularity", "up"), ("groups/psnr_gain", "up"), ("groups/psnr_lost_most", ""),
+        ("groups/time/moved_gap", "up"), ("groups/time/share", ""),
     ],
 )  # fmt: skip
 def test_which_way_is_better(measure, wanted):

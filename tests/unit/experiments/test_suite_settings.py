@@ -1,19 +1,22 @@
 """Files of suites with named settings, fine-tunings, and data of single grids."""
 
+import inspect
 from pathlib import Path
 
 import pytest
 import yaml
 
+from repdib_lightning.bottlenecks import BOTTLENECKS
 from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation.probes import DECODER, PROBES
 from repdib_lightning.experiments.points import points_of
 from repdib_lightning.experiments.suite_file import read_suite
-from repdib_lightning.experiments.suite_measures import FACTOR_PROBES, PICTURE_PROBE
+from repdib_lightning.experiments.suite_measures import FACTOR_PROBES, PICTURE_PROBE, QUANTISERS
 
 RUNS = {"Spiral": {"env": "SpiralWorld", "steps": 300, "env_options.goals": "none"}, "Loop": {"env": "LoopWorld"}}
 FINETUNE = {"agent": "dqn", "with": {"steps": 200, "strides": [2, 2]}, "runs": RUNS}
 GRID = {"settings": {"none": {"config": "bottleneck/none"}, "scratch": {"pretrained": False}}}
+GROUPED = {"probes": "linear,groups"}
 LATER = {"settings": {"own": {"config": "bottleneck/none"}}}
 
 
@@ -144,6 +147,65 @@ def test_measures_of_probes_codes_training_and_fine_tuning_are_known(tmp_path):
     assert (*FACTOR_PROBES, PICTURE_PROBE) == (*PROBES, DECODER)
 
 
+# groups of the probe and of the bottleneck
+
+QUANTISER, HALVES = {"config": "bottleneck/vq"}, {"probes": "linear,groups", "groups": 2}
+OTHER_GROUPS = r"mine\.yaml: {}\.groups is 2, but '{}' quantises {} groups; set {}, or leave it out, in a 'probe' of a"
+
+
+def probed(folder, setting, probe=HALVES, base="factors", own=None):
+    """A suite of the settings ``plain`` and ``ours``, read by its probe or by one of their grid's own."""
+    grid = {"settings": {"plain": {"config": "bottleneck/none"}, "ours": setting}}
+    grid |= {} if own is None else {"probe": own}
+    return read(folder, {"g": grid}, base=base, probe=probe, finetune="REMOVED")
+
+
+@pytest.mark.parametrize(
+    ("setting", "base", "groups"),
+    [
+        (QUANTISER, "factors", 8),
+        ({"model.bottleneck.init_args.groups": 4}, "factors", 4),
+        ({"model.bottleneck.groups": 4}, "factors", 4),
+        ({**QUANTISER, "model.bottleneck.init_args.groups": 16}, "factors", 16),
+        (None, "robot_arm", 8),
+        ({"model.bottleneck": "repdib_lightning.bottlenecks.VectorQuantiser"}, "robot_arm", 8),
+    ],
+)
+def test_a_probe_of_other_groups_than_a_settings_is_refused_before_anything_is_trained(tmp_path, setting, base, groups):
+    for probe, own, key in ((HALVES, None, "probe"), (GROUPED, HALVES, r"grids\.g\.probe")):
+        said = OTHER_GROUPS.format(key, "g/ours", groups, groups)
+        with pytest.raises(UserError, match=said) as error:
+            probed(tmp_path, setting, probe, base, own)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {},
+        {"model.bottleneck.init_args.groups": 2},
+        {"model.bottleneck": "VectorQuantiser"},
+        {"config": "bottleneck/vib"},
+        {"model.bottleneck": "my.own.Bottleneck"},
+        {"model.bottleneck": {"class_path": "Identity"}},
+    ],
+)
+def test_a_probe_may_have_the_groups_of_a_setting_or_cut_what_has_none(tmp_path, setting):
+    assert probed(tmp_path, setting).probe["groups"] == 2
+    probed(tmp_path, setting, {**HALVES, "groups": "2"})
+
+
+def test_a_grid_without_groups_of_its_own_probe_takes_any(tmp_path):
+    assert probed(tmp_path, QUANTISER, probe=GROUPED).probe == GROUPED
+    assert probed(tmp_path, QUANTISER, own=GROUPED).grids[0].probe == GROUPED
+    assert probed(tmp_path, QUANTISER, own={**HALVES, "groups": 8}).grids[0].probe["groups"] == 8
+
+
+def test_the_bottlenecks_that_take_groups_are_those_a_suite_knows():
+    takes = {name for name, kind in BOTTLENECKS.items() if "groups" in inspect.signature(kind).parameters}
+    assert takes == set(QUANTISERS)
+
+
 # mistakes
 
 
@@ -216,6 +278,8 @@ def finetune(**keys):
         (text(measures=["linear/cell/keptt"]), r"must end in kept or error, did you mean 'kept'"),
         (text(measures=["mlp/cell/kept"], probe={"probes": "linear"}), r"'mlp' is no probe or agent here"),
         (text(measures=["decoder/agent/kept"]), r"'decoder' is no probe or agent here"),
+        (text(measures=["groups/mgi"], probe=GROUPED), r"'mgi' is not measured, did you mean 'mig'"),
+        (text(measures=["groups/hue/sharre"], probe=GROUPED), r"'sharre' of a factor is not measured"),
         (text({"g": {"settings": {"s": {"pretrained": False}}}}, measures=["codes/used"]), r"'codes' is no probe or"),
         (text(probe={"probes": "linear,mlpp"}), r"probe\.probes: 'mlpp' is not known, did you mean 'mlp'"),
         (text(probe={"probes": "decoder"}), r"probe\.probes: one of linear, mlp is needed"),
