@@ -18,6 +18,10 @@ VERBS = {
     "inspect": ("repdib_lightning.verbs:inspect", "what is in a data file, what is wrong with it, a contact sheet"),
     "export": ("repdib_lightning.verbs:export", "make a frozen encoder bundle of a run: export runs/x"),
     "encode": ("repdib_lightning.verbs:encode", "a data set as vectors: encode runs/x data/x.h5 data/x_latents.h5"),
+    "features": (
+        "repdib_lightning.verbs:features",
+        "videos as features of frames: features data/x.h5 data/y.h5",
+    ),
     "probe": ("repdib_lightning.verbs:probe", "what a bundle kept and dropped: probe runs/x/bundle data/x.h5"),
     "figures": ("repdib_lightning.verbs:figures", "what each group draws: figures factors runs/x/bundle data/x.h5"),
     "compare": ("repdib_lightning.verbs:compare", "probe several bundles side by side into one HTML report"),

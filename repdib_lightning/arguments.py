@@ -13,10 +13,13 @@ class RememberedArguments(nn.Module):
     """An ``nn.Module`` whose subclasses record their keyword arguments in ``self.arguments``.
 
     The first constructor parameters (a spec or a width, supplied by the package; ``supplied`` of them) are left out;
-    everything else must be plain: strings, numbers, booleans, None, and lists or dictionaries of these.
+    everything else must be plain: strings, numbers, booleans, None, and lists or dictionaries of these. Those in
+    ``forgotten``, which say where training started and change nothing of a module that is filled with weights, are left
+    out too.
     """
 
     supplied: int = 1
+    forgotten: tuple[str, ...] = ()
     arguments: dict[str, Any]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -31,7 +34,8 @@ class RememberedArguments(nn.Module):
             if type(self) is cls:
                 bound = signature.bind(self, *args, **given)
                 bound.apply_defaults()
-                arguments = dict(list(bound.arguments.items())[1 + cls.supplied :])
+                kept = list(bound.arguments.items())[1 + cls.supplied :]
+                arguments = {name: value for name, value in kept if name not in cls.forgotten}
             build(self, *args, **given)
             if type(self) is cls:
                 self.arguments = arguments

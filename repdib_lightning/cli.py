@@ -24,12 +24,15 @@ from repdib_lightning.bottlenecks import BOTTLENECKS
 from repdib_lightning.callbacks import exit_codes, last_good, run_callbacks, run_plugins
 from repdib_lightning.callbacks.checkpoint_files import step_of
 from repdib_lightning.callbacks.codebook_use import CodebookUse
+from repdib_lightning.callbacks.confusion import Confusion
 from repdib_lightning.callbacks.metrics_csv import MetricsCSV
 from repdib_lightning.callbacks.pictures import Pictures
 from repdib_lightning.callbacks.redrawn import Redrawn
+from repdib_lightning.classifiers import CLASSIFIERS
 from repdib_lightning.data.datamodule import EpisodeDataModule
 from repdib_lightning.data.mazes import MazeDataModule
 from repdib_lightning.data.robot_arm import RobotArmDataModule
+from repdib_lightning.decoders import DECODERS
 from repdib_lightning.encoders import ENCODERS
 from repdib_lightning.errors import UserError
 from repdib_lightning.export.run_export import write_model_description
@@ -44,6 +47,8 @@ SLOTS: dict[str, list[str]] = {
     "model.encoder": list(ENCODERS),
     "model.bottleneck": list(BOTTLENECKS),
     "model.objective": list(OBJECTIVES),
+    "model.objective.classifier": list(CLASSIFIERS),
+    "model.objective.decoder": list(DECODERS),
     "model.optimizer": [name for name, item in vars(torch.optim).items() if isinstance(item, type)],
     "data": [EpisodeDataModule.__name__, MazeDataModule.__name__, RobotArmDataModule.__name__],
 }
@@ -94,7 +99,7 @@ class TrainingCLI(LightningCLI):
         kwargs |= {"default_root_dir": str(self.folder), "plugins": [*(given.plugins or []), *run_plugins()]}
         kwargs["use_distributed_sampler"] = False  # the loaders give each process its own share
         safety = run_callbacks(self.folder, config.checkpoint_every, config.checkpoint_keep)
-        self.trainer_defaults = {"callbacks": [Pictures(), Redrawn(), CodebookUse(), *safety]}
+        self.trainer_defaults = {"callbacks": [Pictures(), Redrawn(), CodebookUse(), Confusion(), *safety]}
         return super().instantiate_trainer(**kwargs)
 
     def configuration(self) -> str:
@@ -188,8 +193,12 @@ def _describe_model(cli: TrainingCLI) -> None:
     store = cli.datamodule.store
     training = {"objective": cli.model.objective.label, "run": cli.folder.name}
     data = {"file": store.path.name, "fingerprint": store.fingerprint}
-    modules, drawing = (cli.model.encoder, cli.model.bottleneck), cli.model.objective.find_decoder()
-    write_model_description(cli.folder, *modules, training=training, data=data, drawing=drawing)
+    if held_out := cli.datamodule.held_out:
+        data["held_out"] = held_out
+    found = {"decoder": cli.model.objective.find_decoder(), "classifier": cli.model.objective.find_classifier()}
+    heads = {key: head for key, head in found.items() if head is not None}
+    modules = (cli.model.encoder, cli.model.bottleneck)
+    write_model_description(cli.folder, *modules, training=training, data=data, heads=heads)
 
 
 def validate(arguments: list[str]) -> int:

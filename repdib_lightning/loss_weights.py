@@ -12,6 +12,7 @@ DEFAULT_LOSS_WEIGHTS = {
     "db_prediction": 0.01,
     "db_contrast": 0.01,
 }
+DEFAULT_LOSS_WEIGHTS |= {f"unimodal_{name}": DEFAULT_LOSS_WEIGHTS[name] for name in ("kl", "commitment", "information")}
 """Weight of each named loss term; every other term weighs 1.
 
 ``kl``: VIB coefficient of the paper, in all three tables. ``commitment``: VQ-VAE.
@@ -25,4 +26,6 @@ dimensions. From 0.001 on, multi-step inverse dynamics in the mazes never starts
 
 ``db_*``: a tenth of the published program's, whose terms stand alone (0.1 each; by game down to 0.001 for ``db_kl`` and
 0.01 for ``db_contrast``). At those, multi-step inverse dynamics beside them never starts in the mazes.
+
+``unimodal_*``: a bottleneck inside an encoder costs, in the mean over its modalities, what the one behind it costs.
 """

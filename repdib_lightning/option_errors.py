@@ -31,9 +31,11 @@ def one_line(error: BaseException, options: Iterable[str], classes: dict[str, li
         return _not_accepted(key, match[1], text)
     if match := re.search(r"Expected a dot import path string: (\S+)", text):
         name = match[1].rstrip(".")
-        return UserError(f"{key}: unknown class '{name}', {nearest(name, classes.get(keys[0], []))}")
+        return UserError(f"{key}: unknown class '{name}', {nearest(name, _fitting(key, keys[0], classes))}")
     if match := re.search(r"Expected an import path or a subclass spec, but got (.*?)\. Got value", text):
-        return UserError(f"{key}: expected a class, got '{match[1]}', {nearest(match[1], classes.get(keys[0], []))}")
+        return UserError(
+            f"{key}: expected a class, got '{match[1]}', {nearest(match[1], _fitting(key, keys[0], classes))}"
+        )
     if match := re.search(r"Expected a typing\.Literal\[(.*?)\]\. Got value: (.*)", text):
         choices = re.findall(r"'([^']*)'", match[1])
         return UserError(f"{key}: unknown '{match[2]}', {nearest(match[2], choices)}")
@@ -56,6 +58,12 @@ def _join(keys: list[str]) -> str:
     for key in keys:
         joined = key if not joined or key.startswith(joined) else f"{joined}.{key}"
     return joined
+
+
+def _fitting(key: str, slot: str, classes: dict[str, list[str]]) -> list[str]:
+    """Names of the classes that fit a key: those of the slot with its last word, such as a classifier anywhere."""
+    inside = [names for known, names in classes.items() if known.rpartition(".")[2] == key.rpartition(".")[2]]
+    return inside[0] if inside else classes.get(slot, [])
 
 
 def _nearest_option(given: str, known: list[str]) -> str:

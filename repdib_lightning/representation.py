@@ -1,14 +1,16 @@
-"""THE LightningModule: an encoder, a bottleneck and a self-supervised objective."""
+"""THE LightningModule: an encoder, a bottleneck and an objective."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
+from typing import Any, Literal
 
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor
+from torchmetrics import MetricCollection
 
 from repdib_lightning.bottlenecks import Bottleneck, for_positions
 from repdib_lightning.encoders.augmentation import random_shift
@@ -31,11 +33,16 @@ class RepresentationModule(pl.LightningModule):
         bottleneck: builds the bottleneck from the width M, or from that of one position where the encoder gives a grid.
         objective: builds the objective from M and the spec.
         optimizer: builds the optimiser from the parameters.
-        scheduler: builds a learning-rate scheduler from the optimiser, advanced at every step; none by default.
+        scheduler: builds a learning-rate scheduler from the optimiser; none by default.
         loss_weights: weight of each named loss term; unnamed ones keep their default
             (``repdib_lightning.loss_weights``: kl 0.01, commitment 0.25, ...; 1 where none is listed).
         warmup: term -> steps over which its weight rises linearly from 0.
-        shift: random shift of the pictures while training, in pixels (DrQ-v2: 4 at 84 px); 0 turns it off.
+        shift: random shift of the pictures while training, in pixels (DrQ-v2: 4 at 84 px), the same for all frames of a
+            video; 0 turns it off.
+        scheduler_interval: when the scheduler advances, after every ``step`` or every ``epoch``.
+
+    Attributes:
+        tables: what the last evaluation gave beside numbers, such as ``confusion``, over all processes.
     """
 
     encoder: Encoder
@@ -52,6 +59,7 @@ class RepresentationModule(pl.LightningModule):
         loss_weights: dict[str, float] | None = None,
         warmup: dict[str, int] | None = None,
         shift: int = 4,
+        scheduler_interval: Literal["step", "epoch"] = "step",
     ) -> None:
         super().__init__()
         self.build_encoder, self.build_bottleneck, self.build_objective = encoder, bottleneck, objective
@@ -60,7 +68,10 @@ class RepresentationModule(pl.LightningModule):
         self.named_weights = sorted({*(loss_weights or {}), *(warmup or {})})
         self.warmup = warmup or {}
         self.shift = shift
+        self.scheduler_interval = scheduler_interval
+        self.tables: dict[str, Tensor] = {}
         self._held_out = SampleMeans()
+        self._held_out_metrics: dict[str, MetricCollection] = {}
         if shift < 0:
             raise UserError(f"model.shift must not be negative, is {shift}")
 
@@ -114,13 +125,15 @@ class RepresentationModule(pl.LightningModule):
         optimizer = self.build_optimizer(self.parameters())
         if self.build_scheduler is None:
             return optimizer
-        scheduler = {"scheduler": self.build_scheduler(optimizer), "interval": "step"}
+        scheduler = {"scheduler": self.build_scheduler(optimizer), "interval": self.scheduler_interval}
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
     def forward(self, observations: dict[str, Tensor]) -> BottleneckOutput:
         """Pass name -> (N, *shape) through encoder and bottleneck, without augmentation."""
-        output: BottleneckOutput = self.bottleneck(self.encoder(observations))
-        return output
+        seen = self.encoder.detailed(observations)
+        output: BottleneckOutput = self.bottleneck(seen.features)
+        losses, metrics = seen.losses | output.losses, seen.metrics | output.metrics
+        return replace(output, losses=losses, metrics=metrics, codes_inside=seen.codes)
 
     def training_step(self, batch: Batch, batch_index: int) -> dict[str, Any]:
         """Return the weighted sum as ``loss`` and the raw terms as ``terms``.
@@ -134,6 +147,14 @@ class RepresentationModule(pl.LightningModule):
         self._log(values if self._writes_this_step() else {name: values[name] for name in values if _shown(name)})
         return {"loss": loss, "terms": {name: value.detach() for name, value in output.losses.items()}}
 
+    def on_validation_epoch_start(self) -> None:
+        """Begin to collect."""
+        self._begin_held_out()
+
+    def on_test_epoch_start(self) -> None:
+        """Begin to collect."""
+        self._begin_held_out()
+
     def validation_step(self, batch: Batch, batch_index: int) -> None:
         """Collect the same terms for held-out episodes."""
         self._add_held_out("val", batch)
@@ -143,17 +164,34 @@ class RepresentationModule(pl.LightningModule):
         self._add_held_out("test", batch)
 
     def on_validation_epoch_end(self) -> None:
-        """Log their means over all samples of all processes."""
-        self._log(self._held_out.take(), sync_dist=True)
+        """Log their means over all samples of all processes, and the objective's metrics of the whole set."""
+        self._end_held_out("val")
 
     def on_test_epoch_end(self) -> None:
-        """Log their means over all samples of all processes."""
-        self._log(self._held_out.take(), sync_dist=True)
+        """Log their means over all samples of all processes, and the objective's metrics of the whole set."""
+        self._end_held_out("test")
+
+    def _begin_held_out(self) -> None:
+        self._held_out = SampleMeans()
+        built = self.objective.held_out_metrics()
+        self._held_out_metrics = {name: metrics.to(self.device) for name, metrics in built.items()}
 
     def _add_held_out(self, stage: str, batch: Batch) -> None:
         output = self._evaluate(batch)
         terms = {name: value * self.loss_weights.get(name, 1.0) for name, value in output.losses.items()}
         self._held_out.add(_named(stage, torch.stack(list(terms.values())).sum(), output, terms), len(batch))
+        for name, metrics in self._held_out_metrics.items():
+            metrics.update(*output.updates[name])
+
+    def _end_held_out(self, stage: str) -> None:
+        values, self.tables = self._held_out.take(), {}
+        for metrics in self._held_out_metrics.values():
+            for name, value in metrics.compute().items():
+                if value.ndim:
+                    self.tables[name] = value
+                else:
+                    values[f"{stage}/{name}"] = value
+        self._log(values, sync_dist=True)
 
     def _evaluate(self, batch: Batch) -> ObjectiveOutput:
         """All unweighted losses and metrics of one batch; the objective encodes exactly once."""
@@ -174,7 +212,7 @@ class RepresentationModule(pl.LightningModule):
         return objective
 
     def _augment(self, observation: Tensor) -> Tensor:
-        picture = observation.dtype == torch.uint8 and observation.ndim == 4
+        picture = observation.dtype == torch.uint8 and observation.ndim in (4, 5)
         return random_shift(observation, self.shift) if self.training and picture else observation
 
     def _weight(self, name: str) -> float:
@@ -196,7 +234,7 @@ class RepresentationModule(pl.LightningModule):
 
 def _shown(name: str) -> bool:
     """Whether the progress bar shows it."""
-    return name.partition("/")[2] in ("loss", "action_accuracy", "contrast_accuracy")
+    return name.partition("/")[2] in ("loss", "accuracy", "f1_macro", "action_accuracy", "contrast_accuracy")
 
 
 def _named(stage: str, loss: Tensor, output: ObjectiveOutput, terms: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -19,7 +19,10 @@ SUITE_VERBS = {
 }
 
 
-FIGURES = {"factors": "repdib_lightning.evaluation.factor_figures:draw_factors"}
+FIGURES = {
+    "factors": "repdib_lightning.evaluation.factor_figures:draw_factors",
+    "recognition": "repdib_lightning.evaluation.recognition_figures:draw_recognition",
+}
 
 
 def collect(arguments: list[str]) -> int:
@@ -70,6 +73,14 @@ def encode(arguments: list[str]) -> int:
     from repdib_lightning.evaluation.encoded_store import encode_store
 
     print(f"wrote {_call('encode', encode_store, arguments)}")
+    return 0
+
+
+def features(arguments: list[str]) -> int:
+    """``features DATA OUTPUT [options]``."""
+    from repdib_lightning.data.frame_features import store_features
+
+    print(f"wrote {_call('features', store_features, arguments)}")
     return 0
 
 
@@ -138,7 +149,7 @@ def _comparison_options(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("output", type=Path, help="the HTML page to write (.html)")
     parser.add_argument("runs", nargs="+", help="runs that were exported, or bundles; NAME=PATH names one")
     parser.add_argument(
-        "--probes", default="linear,mlp", help="some of linear,mlp,decoder,groups (default: linear,mlp)"
+        "--probes", default="linear,mlp", help="some of linear,mlp,decoder,groups,recognition (default: linear,mlp)"
     )
     parser.add_argument("--groups", type=int, help="for groups: how many to cut a latent into that is not quantised")
     parser.add_argument("--seed", type=int, default=0, help="of the MLP and of the permutation null (default: 0)")

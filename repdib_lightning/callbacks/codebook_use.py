@@ -1,4 +1,4 @@
-"""How many codes each group uses on the held-out data."""
+"""How many codes each group, and each modality, uses on the held-out data."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch.callbacks import Callback
-from torch import Tensor
+from torch import Tensor, nn
 from torchmetrics import Metric
 
+from repdib_lightning.bottlenecks.base import Bottleneck
 from repdib_lightning.bottlenecks.codebook import count_codes, perplexity
 from repdib_lightning.callbacks.pictures import tensorboards
 from repdib_lightning.records import BottleneckOutput
@@ -37,39 +38,62 @@ class CodeHistogram(Metric):
 class CodebookUse(Callback):
     """Logs, at the end of each validation, perplexity and used codes of every group, and a picture of the histogram.
 
-    Names: ``val/perplexity/group_0`` (effective number of codes, 1 to L), ``val/used/group_0`` (codes that occur).
+    Names: ``val/perplexity/group_0`` (effective number of codes, 1 to L), ``val/used/group_0`` (codes that occur). An
+    encoder that quantises its modalities adds ``val/perplexity/cam1`` and ``val/used/cam1``, means over their groups.
     Nothing is logged for bottlenecks without codes, or before the quantiser has started.
     """
 
     def __init__(self) -> None:
         self._histogram: CodeHistogram | None = None
+        self._inside: dict[str, CodeHistogram] = {}
         self._hook: Any = None
 
     def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Listen to what the bottleneck returns."""
-        bottleneck: Any = pl_module.bottleneck
-        if not bottleneck.groups:
-            return
-        self._histogram = CodeHistogram(bottleneck.groups, bottleneck.codes).to(pl_module.device)
-        self._hook = bottleneck.register_forward_hook(self._count)
+        """Listen to what the module returns."""
+        self._inside = {}
+        if _quantiser(pl_module) is not None:
+            self._hook = pl_module.register_forward_hook(self._count)
 
-    def _count(self, module: Any, inputs: Any, output: BottleneckOutput) -> None:
-        if output.codes is not None and self._histogram is not None:
+    def _count(self, module: Any, inputs: Any, output: Any) -> None:
+        if not isinstance(output, BottleneckOutput):  # of a whole step, where several processes train
+            return
+        if output.codes is not None:
+            if self._histogram is None:
+                self._histogram = CodeHistogram(module.bottleneck.groups, module.bottleneck.codes).to(module.device)
             self._histogram.update(output.codes)
+        for name, codes in output.codes_inside.items():
+            if name not in self._inside:
+                quantiser = _quantiser(module.encoder)
+                assert quantiser is not None
+                self._inside[name] = CodeHistogram(quantiser.groups, quantiser.codes).to(module.device)
+            self._inside[name].update(codes[(codes >= 0).all(dim=1)])  # less those of clips that lack the modality
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Log what was counted."""
         if self._hook is None:
             return
         self._hook.remove()
-        assert self._histogram is not None
-        histogram, self._histogram, self._hook = self._histogram, None, None
-        if trainer.sanity_checking or not histogram.update_called:
+        histogram, inside = self._histogram, self._inside
+        self._histogram, self._inside, self._hook = None, {}, None
+        if trainer.sanity_checking:
             return
-        counts = histogram.compute()
-        values = {f"val/perplexity/group_{g}": float(value) for g, value in enumerate(perplexity(counts))}
-        values |= {f"val/used/group_{g}": float(value) for g, value in enumerate((counts > 0).sum(-1))}
+        values: dict[str, float] = {}
+        for name, codes in inside.items():
+            counts = codes.compute()
+            if not counts.any():
+                continue
+            values[f"val/perplexity/{name}"] = float(perplexity(counts).mean())
+            values[f"val/used/{name}"] = float((counts > 0).sum(-1).float().mean())
+        if histogram is not None:
+            counts = histogram.compute()
+            values |= {f"val/perplexity/group_{g}": float(value) for g, value in enumerate(perplexity(counts))}
+            values |= {f"val/used/group_{g}": float(value) for g, value in enumerate((counts > 0).sum(-1))}
+            shares = counts.sort(-1, descending=True).values / counts.amax(-1, keepdim=True).clamp(min=1)
+            for writer in tensorboards(trainer):
+                writer.add_image("codes/use", shares[None], trainer.global_step)
         pl_module.log_dict(values, sync_dist=True)
-        shares = counts.sort(-1, descending=True).values / counts.amax(-1, keepdim=True).clamp(min=1)
-        for writer in tensorboards(trainer):
-            writer.add_image("codes/use", shares[None], trainer.global_step)
+
+
+def _quantiser(module: nn.Module) -> Bottleneck | None:
+    """The first bottleneck with codes inside; all modalities of an encoder have the same."""
+    return next((part for part in module.modules() if isinstance(part, Bottleneck) and part.groups), None)

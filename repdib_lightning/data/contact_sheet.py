@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
+from repdib_lightning.data.clip_picture import draw_clip
+from repdib_lightning.data.clips import holds_clips
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.data.frame_captions import captions
@@ -17,15 +19,19 @@ _HEAD = 64
 
 
 def draw_contact_sheet(store: EpisodeStore, path: Path) -> Path:
-    """Write a PNG of frames with their factors below, by the names of their classes where the store has them.
+    """Write a PNG of frames with their factors, by the names of their classes where the store has them.
 
     Four episodes spread over the store, each with eight frames spread over it, first and last row included, and the
-    actions taken at them. Where every episode has one row, 32 of them, spread over the store.
+    actions taken at them. Where every episode has one row, 32 of them, spread over the store; where that row is a clip,
+    four of them, each with eight frames of every view and the readings of its sensors.
 
     Raises:
         UserError: the PNG cannot be written.
     """
-    summary, blocks = _pictures(store) if (store.lengths == 1).all() else _episodes(store)
+    if (store.lengths == 1).all():
+        summary, blocks = _clips(store) if holds_clips(store) else _pictures(store)
+    else:
+        summary, blocks = _episodes(store)
     width = max(width_of(_COLUMNS), *(block.width for block in blocks))
     sheet = Image.new("RGB", (width, _HEAD + sum(block.height for block in blocks)), PAPER)
     pen = ImageDraw.Draw(sheet)
@@ -62,6 +68,14 @@ def _pictures(store: EpisodeStore) -> tuple[str, list[Image.Image]]:
         blocks.append(draw_columns(store, rows, headings, captions(store, rows, actions=False)))
     noun = "pictures" if any(spec.is_image for spec in store.observations.values()) else "rows"
     return f"{count:,} {noun}; {'all' if len(chosen) == count else len(chosen)} of them", blocks
+
+
+def _clips(store: EpisodeStore) -> tuple[str, list[Image.Image]]:
+    count = len(store.lengths)
+    chosen = _spread(count, _EPISODES)
+    splits = _split_of(store, chosen)
+    blocks = [draw_clip(store, int(clip), split, _COLUMNS) for clip, split in zip(chosen, splits, strict=True)]
+    return f"{count:,} clips; {'all' if len(chosen) == count else len(chosen)} of them", blocks
 
 
 def _episodes(store: EpisodeStore) -> tuple[str, list[Image.Image]]:

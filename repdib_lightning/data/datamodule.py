@@ -10,7 +10,9 @@ import lightning.pytorch as pl
 import torch
 from torch.utils.data import DataLoader
 
+from repdib_lightning.data.channel_statistics import training_statistics
 from repdib_lightning.data.episodes import EpisodeStore
+from repdib_lightning.data.held_out import as_names
 from repdib_lightning.data.loading import FutureFrames, ResumableLoader, as_it_is, evaluation_batches
 from repdib_lightning.data.resident import Mapped, Resident, Source
 from repdib_lightning.data.sampling import FutureSampling
@@ -38,6 +40,9 @@ class EpisodeDataModule(pl.LightningDataModule):
             What is drawn stays as it is. Objectives that predict the next latent need it; the others leave it aside.
         collect: words of a ``collect`` command that makes the file where it is absent, without the path, such as
             ``control --distractors video``.
+        target: the categorical factor that is to be recognised, such as ``activity``; none where it is empty.
+        held_out: names of values of categorical factors, such as {"subject": ["17", "18"]}: the episodes that have any
+            of them are held out, whatever the file marks, and all others train.
     """
 
     def __init__(
@@ -53,12 +58,15 @@ class EpisodeDataModule(pl.LightningDataModule):
         resident: bool = False,
         next_frame: bool = False,
         collect: str = "",
+        target: str = "",
+        held_out: dict[str, list[str | int]] | None = None,
     ) -> None:
         super().__init__()
         self.path = Path(path)
         self.batch_size, self.horizon, self.futures = batch_size, horizon, futures
         self.frame_stack, self.views, self.workers, self.seed = frame_stack, views, workers, seed
         self.resident, self.next_frame, self.collect = resident, next_frame, collect
+        self.target, self.held_out = target, as_names(held_out)
         for name, least in (("batch_size", 1), ("horizon", 1), ("futures", 0), ("frame_stack", 1)):
             if getattr(self, name) < least:
                 raise UserError(f"data.{name} must be at least {least}, is {getattr(self, name)}")
@@ -87,11 +95,14 @@ class EpisodeDataModule(pl.LightningDataModule):
         """Open and validate the store. Raises UserError, naming file and key, where something is wrong."""
         if self.store is not None:
             return
-        store = EpisodeStore(self.path)
+        store = EpisodeStore(self.path, self.held_out)
         for view in self.views or []:
             if view not in store.observations:
                 raise UserError(f"{self.path}: has no observation '{view}', {nearest(view, store.observations)}")
+        if self.target:
+            check_target(store, self.target)
         self.store = store
+        self._measured = training_statistics(store, self._used_views())
         self._training = self._sampling("train")
         self._evaluation = self._sampling("evaluation")
 
@@ -114,9 +125,12 @@ class EpisodeDataModule(pl.LightningDataModule):
         for name in self._used_views():
             array = self.store.observations[name]
             shape = (array.shape[0] * self.frame_stack, *array.shape[1:])
-            observations[name] = ArraySpec(shape, array.dtype)
+            measured = [tuple(part.tolist()) for part in self._measured.get(name, ())]
+            observations[name] = ArraySpec(shape, array.dtype, *measured)
         horizon = self.horizon if self.futures else 0
-        return DataSpec(observations, self.store.actions_spec, self.frame_stack, horizon, self.next_frame)
+        classes = tuple(self.store.value_names(self.target)) if self.target else ()
+        actions = self.store.actions_spec
+        return DataSpec(observations, actions, self.frame_stack, horizon, self.next_frame, self.target, classes)
 
     def example(self, count: int = 2) -> Batch:
         """Some held-out samples, evenly spread, since neighbours may be alike. Only after :meth:`setup`."""
@@ -164,9 +178,20 @@ class EpisodeDataModule(pl.LightningDataModule):
             names = [f"observations/{view}" for view in self._used_views()]
             if self.store.actions_spec is not None:
                 names.append("actions")
+            if self.target:
+                names.append(f"factors/{self.target}")
             self._kept = Resident(self.store, names, device)
         return self._kept
 
     def _frames(self, sampling: FutureSampling, source: Source) -> FutureFrames:
         assert self.store is not None
-        return FutureFrames(self.store, sampling, self.frame_stack, self._used_views(), source)
+        return FutureFrames(self.store, sampling, self.frame_stack, self._used_views(), source, self.target)
+
+
+def check_target(store: EpisodeStore, target: str) -> None:
+    """Raise UserError, naming the file, unless the target is a categorical factor of the store."""
+    known = [name for name, spec in store.factors.items() if spec.scale == "categorical"]
+    if target not in known:
+        what = f"factor '{target}' is continuous" if target in store.factors else f"has no factor '{target}'"
+        hint = nearest(target, known) or "the file has no categorical factor"
+        raise UserError(f"{store.path}: data.target: {what}, {hint}")

@@ -204,6 +204,22 @@ def check_episode(where: str, columns: dict[str, Column], given: dict[str, Any])
     }
 
 
+def check_recording(where: str, recording: Any, *, stated: bool) -> int | None:
+    """The number of the recording as it is stored, None where the writer was made without.
+
+    Raises:
+        UserError: naming the episode; it is missing, was not stated, or is no whole number from 0 on.
+    """
+    if not stated:
+        if recording is None:
+            return None
+        raise UserError(f"{where}: recording is {recording!r}, but the writer was made without recordings=True")
+    whole = isinstance(recording, Integral) and not isinstance(recording, bool)
+    if not whole or not 0 <= int(recording) < 2**63:
+        raise UserError(f"{where}: recording is {recording!r}; expected a whole number of at least 0")
+    return int(recording)
+
+
 def flat(where: str, groups: dict[str, Any], arrays: dict[str, Any]) -> dict[str, Any]:
     """Arguments of ``add_episode`` by key in the store; what is None was not handed in."""
     given: dict[str, Any] = {}

@@ -10,11 +10,14 @@ from typing import Any
 import h5py
 import numpy as np
 
+from repdib_lightning.data.class_names import stated_names
+from repdib_lightning.data.held_out import HeldOut, as_names, held_out_episodes
 from repdib_lightning.data.validation import (
     action_spec,
     attribute,
     check_episodes,
     check_format,
+    check_recordings,
     check_rows,
     factor_spec,
     mask_width,
@@ -34,13 +37,20 @@ class EpisodeStore:
 
     Args:
         path: the HDF5 file.
+        held_out: names of values of categorical factors, such as {"subject": ["17", "18"]}: the episodes that have any
+            of them are the evaluation split, whatever the file marks, and all others are for training.
+
+    Attributes:
+        evaluation: (E,) bool, what the file marks; the splits are those of :meth:`episodes`.
+        recordings: (E,) int64, episodes cut of one recording share a number; all differ where the file has none.
+        held_out: as given, each value as text; None where the file's own split holds.
 
     Raises:
         UserError: naming file, key and episode, if the file is missing, truncated, not a store, of a newer schema,
-            or if its arrays disagree.
+            or if its arrays disagree; or if what is held out is unknown, nothing, or everything.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, held_out: HeldOut | None = None) -> None:
         self.path = Path(path)
         with self._open() as file:
             check_format(self.path, file)
@@ -51,14 +61,17 @@ class EpisodeStore:
             self.starts = per_episode(self.path, file, "start")
             self.lengths = per_episode(self.path, file, "length")
             marked = "episodes/evaluation" in file
-            held_out = per_episode(self.path, file, "evaluation") if marked else np.zeros(len(self.starts))
-            self.evaluation = held_out.astype(bool)
+            marks = per_episode(self.path, file, "evaluation") if marked else np.zeros(len(self.starts))
+            self.evaluation = marks.astype(bool)
             check_episodes(self.path, self.starts, self.lengths, self.evaluation, self.rows)
+            self.recordings = self._read_recordings(file)
             self.actions_spec = action_spec(self.path, file, self.starts, self.lengths)
             factors, masks = members(self.path, file, "factors"), members(self.path, file, "masks")
             self.factors = {name: factor_spec(self.path, name, data) for name, data in factors}
             self.masks = {name: mask_width(self.path, name, data, self.observations) for name, data in masks}
         self._maps: dict[str, Any] = {}
+        self.held_out = as_names(held_out)
+        self._chosen = None if self.held_out is None else held_out_episodes(self, self.held_out)
 
     def _open(self) -> h5py.File:
         if not self.path.is_file():
@@ -70,6 +83,13 @@ class EpisodeStore:
         except OSError as error:
             reason = "truncated" if "truncated" in str(error) else "not a readable HDF5 file"
             raise UserError(f"{self.path}: {reason} ({str(error).splitlines()[0]})") from error
+
+    def _read_recordings(self, file: h5py.File) -> np.ndarray:
+        if "episodes/recording" not in file:
+            return np.arange(len(self.starts))
+        recordings = per_episode(self.path, file, "recording")
+        check_recordings(self.path, recordings, self.lengths)
+        return recordings
 
     def _locate_all(self, file: h5py.File) -> None:
         """Where each array lies in the file, after a check that it has a row for every time step."""
@@ -112,9 +132,36 @@ class EpisodeStore:
         """(N,) int64: the episode of each row."""
         return np.repeat(np.arange(len(self.starts)), self.lengths)
 
+    @cached_property
+    def row_recordings(self) -> np.ndarray:
+        """(N,) int64: the recording of each row."""
+        return np.repeat(self.recordings, self.lengths)
+
+    def recording_of(self, episode: int) -> int | None:
+        """The recording that the file states for an episode; None where it states none."""
+        return int(self.recordings[episode]) if "episodes/recording" in self else None
+
+    @cached_property
+    def class_names(self) -> dict[str, list[str]]:
+        """Categorical factor, or ``actions`` -> names of all its values, where the file states them."""
+        counts = {name: spec.classes for name, spec in self.factors.items() if spec.scale == "categorical"}
+        if self.actions_spec is not None and self.actions_spec.kind == "discrete":
+            counts["actions"] = self.actions_spec.size
+        return stated_names(self.attributes, counts)
+
+    def value_names(self, factor: str) -> list[str]:
+        """Names of all values of a categorical factor: as the file states them, or their numbers."""
+        return self.class_names.get(factor) or [str(number) for number in range(self.factors[factor].classes)]
+
     def episodes(self, split: Split) -> np.ndarray:
-        """Indices of the episodes of a split: stored as such, or (nothing stored) every fifth is for evaluation."""
-        held_out = self.evaluation if self.evaluation.any() else np.arange(len(self.starts)) % 5 == 4
+        """Indices of the episodes of a split.
+
+        For evaluation are those that are held out by factors, else those that are stored as such, else (nothing is
+        stored) those of every fifth recording.
+        """
+        held_out = self.evaluation if self._chosen is None else self._chosen
+        if not held_out.any():
+            held_out = np.unique(self.recordings, return_inverse=True)[1] % 5 == 4
         return np.flatnonzero(held_out if split == "evaluation" else ~held_out)
 
     def array(self, name: str) -> Any:

@@ -7,6 +7,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from repdib_lightning.data.clips import is_clip
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.inspection_text import file_size
 
@@ -42,9 +43,10 @@ def slow_layouts(store: EpisodeStore) -> list[str]:
             many_rows = decoded > _LARGEST_CHEAP_READ * frame
             pace = "thousands of times" if many_rows and _is_filtered(data) else "about 100 times"
             repacked = store.path.with_name(f"{store.path.stem}_contiguous.h5")
+            what = "clip" if is_clip(store, name) else "frame"
             lines.append(
-                f"'observations/{name}' is slow to read at random ({layout_of(data)}): one frame of {file_size(frame)} "
-                f"decodes {file_size(decoded)}, {pace} slower than contiguous; "
+                f"'observations/{name}' is slow to read at random ({layout_of(data)}): one {what} of "
+                f"{file_size(frame)} decodes {file_size(decoded)}, {pace} slower than contiguous; "
                 f"run: python -m repdib_lightning import store {store.path} {repacked}"
             )
     return lines
@@ -60,7 +62,9 @@ def suspicious_content(store: EpisodeStore, samples: dict[str, np.ndarray]) -> l
     """Lines on content that trains badly. ``samples``: observation -> (n, ...), evenly spread rows."""
     lines = []
     for name, rows in samples.items():
-        if rows.min() == rows.max():
+        if store.observations[name].is_sequence:
+            lines += _dull_readings(name, rows)
+        elif rows.min() == rows.max():
             lines.append(f"'observations/{name}' is {rows.min()} everywhere in {len(rows)} sampled rows: blank")
         if _is_stacked(store, name):
             lines.append(
@@ -77,6 +81,16 @@ def suspicious_content(store: EpisodeStore, samples: dict[str, np.ndarray]) -> l
         if not np.isfinite(values).all():
             lines.append(f"'factors/{name}' holds NaN or infinite values")
     return lines + _unused_actions(store)
+
+
+def _dull_readings(name: str, rows: np.ndarray) -> list[str]:
+    """A line where sampled sequences, (n, T, X), hold nothing, or one value only; what is NaN was not observed."""
+    observed = rows[np.isfinite(rows)]
+    if not observed.size:
+        return [f"'observations/{name}' is missing in all of {len(rows)} sampled clips"]
+    if observed.min() == observed.max():
+        return [f"'observations/{name}' is {observed[0]} wherever observed in {len(rows)} sampled clips: blank"]
+    return []
 
 
 def _short_episodes(store: EpisodeStore) -> list[str]:

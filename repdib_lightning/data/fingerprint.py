@@ -27,10 +27,17 @@ class ContentHash:
         twin._hash = self._hash.copy()
         return twin
 
-    def add_episode(self, arrays: dict[str, np.ndarray], *, evaluation: bool) -> None:
-        """Add the rows of one episode: key in the store -> (T, ...), as stored, and whether it is held out."""
+    def add_episode(self, arrays: dict[str, np.ndarray], *, evaluation: bool, recording: int | None = None) -> None:
+        """Add the rows of one episode.
+
+        Args:
+            arrays: key in the store -> (T, ...), as stored.
+            evaluation: whether it is held out.
+            recording: what it was cut of; None where the store does not say.
+        """
         length = len(next(iter(arrays.values())))
-        self._hash.update(f"{length} {evaluation}".encode())
+        cut_of = "" if recording is None else f" {recording}"
+        self._hash.update(f"{length} {evaluation}{cut_of}".encode())
         for name, array in sorted(arrays.items()):
             self._hash.update(name.encode())
             self._hash.update(np.ascontiguousarray(array).view(np.uint8).data)
@@ -52,8 +59,9 @@ def recompute_fingerprint(store: EpisodeStore, *, progress: bool = False) -> str
         file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
         columns = {name: SequentialRows(file[name]) for name in names if not name.startswith("episodes/")}
         with tqdm(total=store.rows, desc="verify", unit="row", disable=not progress) as bar:
-            for start, length, held_out in zip(store.starts, store.lengths, store.evaluation, strict=True):
+            for episode, (start, length) in enumerate(zip(store.starts, store.lengths, strict=True)):
                 rows = {name: column.read(int(start), int(start + length)) for name, column in columns.items()}
-                content.add_episode(rows, evaluation=bool(held_out))
+                evaluation, recording = bool(store.evaluation[episode]), store.recording_of(episode)
+                content.add_episode(rows, evaluation=evaluation, recording=recording)
                 bar.update(int(length))
     return content.hexdigest()

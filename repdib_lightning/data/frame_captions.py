@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 
+from repdib_lightning.data.class_names import stated_names
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.inspection_text import short_number
 
@@ -17,19 +19,32 @@ def class_names(store: EpisodeStore) -> dict[str, list[str]]:
 
     What another program wrote there is passed over: numbers are shown then.
     """
-    try:
-        stated = json.loads(str(store.attributes.get("classes", "{}")))
-    except ValueError:
-        return {}
     counts = {name: spec.classes for name, spec in store.factors.items() if spec.scale == "categorical"}
     if store.actions_spec is not None and store.actions_spec.kind == "discrete":
         counts["actions"] = store.actions_spec.size
-    named = stated if isinstance(stated, dict) else {}
-    return {
-        key: [str(name) for name in named[key]]
-        for key, count in counts.items()
-        if isinstance(named.get(key), list) and len(named[key]) >= count
-    }
+    return stated_names(store.attributes, counts)
+
+
+def channel_names(store: EpisodeStore, name: str) -> list[str]:
+    """What the attribute ``channels`` calls each channel of an observation; their numbers where it has no such list."""
+    width = store.observations[name].shape[-1]
+    named = _stated(store, "channels").get(name)
+    return [str(channel) for channel in (named if isinstance(named, list) and len(named) == width else range(width))]
+
+
+def rate_of(store: EpisodeStore, name: str) -> float | None:
+    """Steps a second of an observation, as the attribute ``rate`` has it; None where it has none."""
+    rate = _stated(store, "rate").get(name)
+    return float(rate) if isinstance(rate, (int, float)) and rate > 0 else None
+
+
+def _stated(store: EpisodeStore, attribute: str) -> dict[str, Any]:
+    """An attribute that holds a dictionary as JSON; empty where another program wrote anything else there."""
+    try:
+        stated = json.loads(str(store.attributes.get(attribute, "{}")))
+    except ValueError:
+        return {}
+    return stated if isinstance(stated, dict) else {}
 
 
 def captions(store: EpisodeStore, rows: np.ndarray, *, actions: bool) -> list[list[str]]:

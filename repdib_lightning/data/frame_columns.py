@@ -14,8 +14,10 @@ PAPER, INK, FAINT = (255, 255, 255), (32, 36, 44), (112, 118, 130)
 MARGIN = 20
 """Colours of the sheet and of what is written on it; pixels left free at its sides."""
 
-_PANEL = (238, 240, 244)
-_TILE, _GAP, _LINE, _HEADING = 128, 8, 15, 15
+TILE, GAP, PANEL = 128, 8, (238, 240, 244)
+"""Pixels of the side of a tile and between tiles; colour of one that shows no picture."""
+
+_LINE, _HEADING = 15, 15
 
 
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
@@ -25,7 +27,7 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 def width_of(columns: int) -> int:
     """Pixels that so many columns take, margins included."""
-    return 2 * MARGIN + columns * (_TILE + _GAP) - _GAP
+    return 2 * MARGIN + columns * (TILE + GAP) - GAP
 
 
 def draw_columns(
@@ -43,57 +45,59 @@ def draw_columns(
         texts: the lines below each column.
     """
     pictures_first = sorted(store.observations, key=lambda name: not store.observations[name].is_image)
-    strips = {name: _tiles(store, name, rows) for name in pictures_first}
+    strips = {name: tiles_of(store, name, rows) for name in pictures_first}
     label = 18 if len(strips) > 1 else 0
-    heights = {name: max(tile.height for tile in tiles) + label + _GAP for name, tiles in strips.items()}
+    heights = {name: max(tile.height for tile in tiles) + label + GAP for name, tiles in strips.items()}
     lines = max(len(text) for text in texts)
     height = _HEADING + sum(heights.values()) + lines * _LINE + 16
     block = Image.new("RGB", (width_of(len(rows)), height), PAPER)
     pen = ImageDraw.Draw(block)
     for column, heading in enumerate(headings):
-        pen.text((_left(column), 0), _fit(pen, heading), fill=FAINT, font=font(11))
+        pen.text((left_of(column), 0), _fit(pen, heading), fill=FAINT, font=font(11))
     top = _HEADING
     for name, tiles in strips.items():
         if label:
             pen.text((MARGIN, top + 2), name, fill=INK, font=font(12))
         for column, tile in enumerate(tiles):
-            block.paste(tile, (_left(column) + (_TILE - tile.width) // 2, top + label))
+            block.paste(tile, (left_of(column) + (TILE - tile.width) // 2, top + label))
         top += heights[name]
     for column, text in enumerate(texts):
         for number, line in enumerate(text):
-            pen.text((_left(column), top + number * _LINE), _fit(pen, line), fill=INK, font=font(11))
+            pen.text((left_of(column), top + number * _LINE), _fit(pen, line), fill=INK, font=font(11))
     return block
 
 
-def _left(column: int) -> int:
-    return MARGIN + column * (_TILE + _GAP)
+def left_of(column: int) -> int:
+    """Where the tiles of a column begin, in pixels from the left."""
+    return MARGIN + column * (TILE + GAP)
 
 
 def _fit(pen: ImageDraw.ImageDraw, text: str) -> str:
     """Cut a text to the width of a tile."""
-    while len(text) > 1 and pen.textlength(text, font=font(11)) > _TILE:
+    while len(text) > 1 and pen.textlength(text, font=font(11)) > TILE:
         text = text[:-2] + "…"
     return text
 
 
-def _tiles(store: EpisodeStore, name: str, rows: np.ndarray) -> list[Image.Image]:
+def tiles_of(store: EpisodeStore, name: str, rows: np.ndarray) -> list[Image.Image]:
+    """A tile for each of some rows of one observation; one that is no picture shows its extremes."""
     frames = store.gather(f"observations/{name}", rows)
     is_image = store.observations[name].is_image
-    return [_picture(frame) if is_image else _extremes(frame) for frame in frames]
+    return [picture_tile(frame) if is_image else _extremes(frame) for frame in frames]
 
 
-def _picture(frame: np.ndarray) -> Image.Image:
+def picture_tile(frame: np.ndarray) -> Image.Image:
     """(C, H, W) uint8 -> a tile; pixels stay sharp where they grow by a whole factor."""
     shown = frame if len(frame) in (1, 3) else frame[-3:] if len(frame) > 3 else frame[:1]
     pixels = np.repeat(shown, 3, axis=0) if len(shown) == 1 else shown
     image = Image.fromarray(np.ascontiguousarray(pixels.transpose(1, 2, 0)))
     longest = max(image.size)
-    size = (max(1, image.width * _TILE // longest), max(1, image.height * _TILE // longest))
-    return image.resize(size, Image.Resampling.NEAREST if _TILE % longest == 0 else Image.Resampling.LANCZOS)
+    size = (max(1, image.width * TILE // longest), max(1, image.height * TILE // longest))
+    return image.resize(size, Image.Resampling.NEAREST if TILE % longest == 0 else Image.Resampling.LANCZOS)
 
 
 def _extremes(values: np.ndarray) -> Image.Image:
-    tile = Image.new("RGB", (_TILE, 44), _PANEL)
+    tile = Image.new("RGB", (TILE, 44), PANEL)
     pen = ImageDraw.Draw(tile)
     pen.text((8, 6), f"max {short_number(values.max())}", fill=INK, font=font(12))
     pen.text((8, 23), f"min {short_number(values.min())}", fill=INK, font=font(12))

@@ -8,6 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from repdib_lightning.data.clip_report import describe_clips
+from repdib_lightning.data.clips import is_clip
 from repdib_lightning.data.contact_sheet import draw_contact_sheet
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.findings import (
@@ -24,7 +26,7 @@ from repdib_lightning.data.outputs import check_output_file
 from repdib_lightning.data.partial import describe_unfinished
 from repdib_lightning.errors import UserError
 
-_MOST_LISTED = 12
+_MOST_LISTED, _LARGEST_SAMPLE = 12, 2**26
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,7 @@ def inspect_store(path: Path, *, contact_sheet: Path | None = None, verify: bool
             *_actions(store),
             *_rewards(store),
             *_factors(store),
+            *describe_clips(store),
         ]
     )
     warnings = slow_layouts(store) + suspicious_content(store, samples)
@@ -115,6 +118,8 @@ def _sample(store: EpisodeStore) -> dict[str, np.ndarray]:
     for name in store.observations:
         key = f"observations/{name}"
         wanted = 256 if isinstance(store.array(key), np.memmap) else 16
+        if is_clip(store, name):
+            wanted = min(wanted, max(16, _LARGEST_SAMPLE // store.array(key)[0].nbytes))
         rows = np.unique(np.linspace(0, store.rows - 1, wanted).astype(np.int64))
         samples[name] = store.gather(key, rows)
     return samples
@@ -152,8 +157,11 @@ def _keys(store: EpisodeStore, samples: dict[str, np.ndarray]) -> list[str]:
 
     def add(name: str, item: h5py.Dataset | h5py.Group) -> None:
         if isinstance(item, h5py.Dataset):
-            values = samples.get(name.removeprefix("observations/"))
-            shown = "" if values is None or not name.startswith("observations/") else _range(values)
+            observation = name.removeprefix("observations/")
+            values = samples.get(observation) if name.startswith("observations/") else None
+            if values is not None and store.observations[observation].is_sequence:
+                values = values[np.isfinite(values)]
+            shown = "" if values is None else _range(values) if values.size else "nothing observed"
             rows.append([name, " x ".join(map(str, item.shape)), str(item.dtype), layout_of(item), shown])
 
     with h5py.File(store.path, "r") as file:

@@ -24,7 +24,9 @@ class FutureFrames(Dataset[Batch]):
         sampling: which rows make a sample.
         frame_stack: S.
         views: observations to read.
-        source: where their rows and those of the actions are gathered from; the memory-mapped file by default.
+        source: where their rows, those of the actions and of the target are gathered from; the memory-mapped file by
+            default.
+        target: the categorical factor whose class at the anchor is to be recognised; none where it is empty.
     """
 
     def __init__(
@@ -34,8 +36,9 @@ class FutureFrames(Dataset[Batch]):
         frame_stack: int,
         views: list[str],
         source: Source | None = None,
+        target: str = "",
     ) -> None:
-        self.store, self.sampling = store, sampling
+        self.store, self.sampling, self.target = store, sampling, target
         self.frame_stack, self.views = frame_stack, views
         self.source = source or Mapped(store)
 
@@ -55,7 +58,8 @@ class FutureFrames(Dataset[Batch]):
             frames = self.source.gather(f"observations/{name}", rows)
             observations[name] = frames.reshape(*offsets.shape, -1, *frames.shape[2:])
         actions = self.source.gather("actions", anchors) if self.store.actions_spec is not None else None
-        return Batch(observations, actions, torch.from_numpy(offsets), torch.from_numpy(anchors))
+        targets = self.source.gather(f"factors/{self.target}", anchors).reshape(-1) if self.target else None
+        return Batch(observations, actions, torch.from_numpy(offsets), torch.from_numpy(anchors), targets)
 
 
 class ResumableLoader:

@@ -33,7 +33,7 @@ def make_empty(path: Path, statement: Statement) -> None:
         for key, column in statement.columns.items():
             data = _dataset(file, key, (statement.rows, *column.stored_shape), column.stored_dtype)
             data.attrs.update(statement.attributes_of(key))
-        for name in ("start", "length"):
+        for name in ("start", "length", *(["recording"] if statement.recordings else [])):
             _dataset(file, f"episodes/{name}", (statement.episodes,), "int64")
         _dataset(file, "episodes/evaluation", (statement.episodes,), "bool")
 
@@ -89,9 +89,9 @@ class RowFile:
 
     def reserve_episodes(self) -> None:
         """Take disk space for the arrays of the episodes, so that no full disk writes half a length."""
-        for name in ("start", "length", "evaluation"):
-            offset, width = self._places[f"episodes/{name}"]
-            write_at(self._handle, bytes(width * self.episodes), offset)
+        for key, (offset, width) in self._places.items():
+            if key.startswith("episodes/"):
+                write_at(self._handle, bytes(width * self.episodes), offset)
 
     def lengths(self) -> np.ndarray:
         """(episodes that were in the file when it was opened,) int64: their rows.

@@ -114,7 +114,8 @@ class FutureSampling:
 
 def _empty_split(store: EpisodeStore, split: Split) -> str:
     if split == "evaluation":
-        hint = "mark some in `episodes/evaluation`, or have at least 5 episodes (every fifth is held out then)"
+        whole = "recordings" if "episodes/recording" in store else "episodes"
+        hint = f"mark some in `episodes/evaluation`, or have at least 5 {whole} (every fifth is held out then)"
     else:
         hint = "all are marked in `episodes/evaluation`; leave some for training"
     return f"{store.path}: has no episode for {split} ({len(store.lengths)} in all): {hint}"

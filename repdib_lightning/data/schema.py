@@ -8,8 +8,12 @@
     /terminations          (N,) bool, /truncations (N,) bool   optional: that action ended the episode
     /episodes/start        (E,) int64, /episodes/length (E,) int64
     /episodes/evaluation   (E,) bool                           optional: never trained on
+    /episodes/recording    (E,) int64                          optional: episodes that nothing may split share one
     /factors/<name>        (N, ...)  ground truth, attributes kind, scale (and classes)
     /masks/<observation>   (N, H, ceil(W / 8)) uint8           optional: bit-packed pixels of the agent
+
+A clip is an episode of one row: a video is (N, T, C, H, W) uint8, readings of a sensor are (N, T, X) float32. What is
+missing of it, or lies beyond its end, is frames of zeros only, and NaN; a frame that was seen is never all zeros.
 
 An episode's last row holds the final observation and no action: -1 (discrete) or 0 (continuous), never sampled.
 """

@@ -16,6 +16,7 @@ from repdib_lightning.data.validation import attribute
 from repdib_lightning.records import ActionSpec
 
 _LONGEST_SHOWN = 60
+_RECORDING = "episodes/recording"
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Statement:
         factors: name -> what is known of each factor.
         masks: observation name -> (H, W) of its agent mask.
         attributes: of the file, as HDF5 holds them.
+        recordings: whether each episode states the recording that it was cut of.
     """
 
     rows: int
@@ -39,6 +41,7 @@ class Statement:
     factors: dict[str, FactorSpec]
     masks: dict[str, tuple[int, int]]
     attributes: dict[str, Any]
+    recordings: bool = False
 
     def attributes_of(self, key: str) -> dict[str, Any]:
         """Attributes of the data set of a column."""
@@ -56,6 +59,8 @@ class Statement:
         layout: dict[str, Any] = {"rows": self.rows, "episodes": self.episodes}
         for key, column in self.columns.items():
             layout[key] = _array(column.stored_shape, np.dtype(column.stored_dtype), self.attributes_of(key))
+        if self.recordings:
+            layout[_RECORDING] = _array((), np.dtype("int64"), {})
         fixed = {"format": FORMAT, "schema_version": SCHEMA_VERSION}
         return Facts(_options({**fixed, **self.attributes}), layout)
 
@@ -88,6 +93,8 @@ def stated_in(file: h5py.File) -> Facts:
         if isinstance(item, h5py.Dataset) and not key.startswith("episodes/"):
             arrays[key] = _array(item.shape[1:], item.dtype, {name: attribute(item, name) for name in item.attrs})
             counts.add(len(item))
+        elif key == _RECORDING:
+            arrays[key] = _array((), item.dtype, {})
 
     file.visititems(add)
     episodes = len(file["episodes/length"])

@@ -140,6 +140,14 @@ def check_episodes(path: Path, starts: np.ndarray, lengths: np.ndarray, evaluati
         raise UserError(f"{path}: episodes cover {int(ends[-1])} rows, the arrays hold {rows}")
 
 
+def check_recordings(path: Path, recordings: np.ndarray, lengths: np.ndarray) -> None:
+    """Raise UserError unless there is a recording for each episode."""
+    if len(recordings) != len(lengths):
+        raise UserError(
+            f"{path}: 'episodes/recording' ({len(recordings)}) and 'episodes/length' ({len(lengths)}) disagree"
+        )
+
+
 def action_spec(path: Path, file: h5py.File, starts: np.ndarray, lengths: np.ndarray) -> ActionSpec | None:
     """Kind and size of the actions, whose values are checked in every row that holds one.
 

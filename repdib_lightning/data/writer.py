@@ -11,7 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from repdib_lightning.data.episode_checks import check_episode, check_stated, columns_of, flat, plain_attributes
+from repdib_lightning.data.episode_checks import (
+    check_episode,
+    check_recording,
+    check_stated,
+    columns_of,
+    flat,
+    plain_attributes,
+)
 from repdib_lightning.data.files import sync_directory
 from repdib_lightning.data.fingerprint import ContentHash
 from repdib_lightning.data.partial import open_partial, partial_of
@@ -44,6 +51,7 @@ class EpisodeWriter:
         masks: observation name -> (H, W) of its agent mask.
         rewards: whether rewards, terminations and truncations are written.
         attributes: environment, generating configuration, seed, licence; plain values, nested ones become JSON.
+        recordings: whether each episode states the recording that it was cut of.
         overwrite: replace an existing file; with ``resume``, discard an unfinished recording, too.
         resume: keep what an interruption leaves, and go on with it.
 
@@ -66,6 +74,7 @@ class EpisodeWriter:
         masks: dict[str, tuple[int, int]] | None = None,
         rewards: bool = False,
         attributes: dict[str, Any] | None = None,
+        recordings: bool = False,
         overwrite: bool = False,
         resume: bool = False,
     ) -> None:
@@ -80,12 +89,12 @@ class EpisodeWriter:
         self.rows, self.episodes = rows, episodes
         self.observations, self.actions = observations, actions
         self._columns = columns_of(observations, actions, factors, masks, rewards)
-        self._resume, self._overwrite = resume, overwrite
+        self._resume, self._overwrite, self._recordings = resume, overwrite, recordings
         self._row = self._episode = 0
         self._hash = ContentHash()
         self._temporary = self.path.with_name(f".{self.path.name}.tmp-{os.getpid()}")
         self._file: RowFile | None = None
-        statement = Statement(rows, episodes, self._columns, actions, factors, masks, plain)
+        statement = Statement(rows, episodes, self._columns, actions, factors, masks, plain, recordings)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             remove_leftovers(self.path)
@@ -115,7 +124,9 @@ class EpisodeWriter:
         for length in map(int, self._file.lengths()):
             rows = {key: self._file.read(key, self._row, length) for key in self._columns}
             evaluation = bool(self._file.read("episodes/evaluation", self._episode, 1)[0, 0])
-            self._hash.add_episode(rows, evaluation=evaluation)
+            stated = self._file.read("episodes/recording", self._episode, 1) if self._recordings else None
+            recording = None if stated is None else int(stated.view(np.int64)[0, 0])
+            self._hash.add_episode(rows, evaluation=evaluation, recording=recording)
             self._row, self._episode = self._row + length, self._episode + 1
 
     def _check_space(self, observations: dict[str, ArraySpec]) -> None:
@@ -149,6 +160,7 @@ class EpisodeWriter:
         factors: dict[str, np.ndarray] | None = None,
         masks: dict[str, np.ndarray] | None = None,
         evaluation: bool = False,
+        recording: int | None = None,
     ) -> None:
         """Append one episode of T rows.
 
@@ -159,6 +171,8 @@ class EpisodeWriter:
             factors: name -> (T, ...).
             masks: observation name -> (T, H, W) bool.
             evaluation: the episode is never trained on.
+            recording: number of the recording that it was cut of; required where the writer was made with
+                ``recordings``.
 
         Raises:
             UserError: an array that was stated is missing, one was not stated, or shape, type or values are not as
@@ -169,6 +183,7 @@ class EpisodeWriter:
             raise UserError(f"{where}: the writer is closed; add episodes inside its `with` block")
         if not isinstance(evaluation, (bool, np.bool_)):
             raise UserError(f"{where}: evaluation is {evaluation!r}; expected True or False")
+        number = check_recording(where, recording, stated=self._recordings)
         groups = {"observations": observations, "factors": factors, "masks": masks}
         single = {"actions": actions, "rewards": rewards, "terminations": terminations, "truncations": truncations}
         arrays = check_episode(where, self._columns, flat(where, groups, single))
@@ -178,12 +193,14 @@ class EpisodeWriter:
             stated = f"the writer was made for {self.rows} rows in {self.episodes} episodes"
             raise UserError(f"{where} ends at row {rows.stop}, but {stated}")
         content = self._hash.copy()
-        content.add_episode(arrays, evaluation=bool(evaluation))
+        content.add_episode(arrays, evaluation=bool(evaluation), recording=number)
         try:
             for key, array in arrays.items():
                 self._file.write(key, rows.start, array)
             self._file.write("episodes/start", self._episode, np.array([rows.start]))
             self._file.write("episodes/evaluation", self._episode, np.array([bool(evaluation)]))
+            if number is not None:
+                self._file.write("episodes/recording", self._episode, np.array([number]))
             if self._resume:
                 self._file.flush()  # nothing may say that rows are there before they are
             self._file.write("episodes/length", self._episode, np.array([length]))

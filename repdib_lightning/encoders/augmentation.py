@@ -12,14 +12,17 @@ def random_shift(image: Tensor, pad: int) -> Tensor:
     """Move each picture by up to ``pad`` pixels in both directions; the border is repeated outwards.
 
     Args:
-        image: (N, C, H, W) of any dtype.
+        image: (N, C, H, W) of any dtype, or videos (N, T, C, H, W).
         pad: largest shift in pixels; 0 returns the input.
 
     Returns:
-        (N, C, H, W), every picture with a shift of its own, drawn from torch's global generator.
+        Of the same shape, every picture with a shift of its own, every video with one for all its frames, drawn from
+        torch's global generator.
     """
     if pad == 0:
         return image
+    if image.ndim == 5:
+        return random_shift(image.flatten(1, 2), pad).unflatten(1, image.shape[1:3])
     count, _, height, width = image.shape
     shift = own_rows(torch.randint(-pad, pad + 1, (2, rows_of_all(count), 1), device=image.device), dim=1)
     rows = (torch.arange(height, device=image.device) + shift[0]).clamp_(0, height - 1)

@@ -2,11 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 from torch import Tensor
 
 from repdib_lightning.arguments import RememberedArguments
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import DataSpec
+
+
+@dataclass
+class EncoderOutput:
+    """What an encoder gives beside its features, where it has something inside that can be looked at.
+
+    Attributes:
+        features: (N, M).
+        losses: named scalars of bottlenecks inside, unweighted.
+        metrics: named detached scalars worth logging.
+        codes: name of a modality -> (N, G) int64, where it is quantised.
+        attention: ``modalities`` -> (N, number of them), and the name of a modality -> (N, steps): non-negative, with
+            sum 1 over what was observed, 0 for what was not.
+    """
+
+    features: Tensor
+    losses: dict[str, Tensor] = field(default_factory=dict)
+    metrics: dict[str, Tensor] = field(default_factory=dict)
+    codes: dict[str, Tensor] = field(default_factory=dict)
+    attention: dict[str, Tensor] = field(default_factory=dict)
 
 
 class Encoder(RememberedArguments):
@@ -32,3 +54,10 @@ class Encoder(RememberedArguments):
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
         """Encode name -> (N, *shape) (uint8 pictures, float32 sensors) into (N, M)."""
         raise NotImplementedError
+
+    def detailed(self, observations: dict[str, Tensor]) -> EncoderOutput:
+        """The same features with all that is inside: losses of bottlenecks, their codes, attention."""
+        return EncoderOutput(self(observations))
+
+    def require_ready(self) -> None:
+        """Raise UserError, with what to do about it, unless every bottleneck inside is ready to be exported."""

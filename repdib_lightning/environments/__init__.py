@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 COLLECTORS = {
+    "activities": "repdib_lightning.environments.collect_activities:collect_activities",
     "control": "repdib_lightning.environments.collect_control:collect_control",
     "emoji_styles": "repdib_lightning.environments.collect_emoji_styles:collect_emoji_styles",
     "maze": "repdib_lightning.environments.collect_maze:collect_maze",
     "policies": "repdib_lightning.environments.train_policies:train_policies",
     "robot_arm": "repdib_lightning.environments.collect_robot_arm:collect_robot_arm",
     "shapes": "repdib_lightning.environments.collect_shapes:collect_shapes",
+    "smartwatch": "repdib_lightning.environments.collect_smartwatch:collect_smartwatch",
 }
 """Environment -> ``module:function`` that records a data set of it: ``function(path, *, seed, overwrite, ...)``."""
 

@@ -93,7 +93,7 @@ def measure_pictures(
     # Summed in float64, the mean of pixels that never vary is exact: rounding must not pass for variance.
     means = {view: target.mean(0, dtype=np.float64).astype(np.float32) for view, target in targets.items()}
     gram = sum(_gram(targets[view] - means[view]) for view in views)
-    folds = episode_folds(store.row_episodes[rows[inside]])
+    folds = episode_folds(store.row_recordings[rows[inside]])
     decoder = fit_kernel_ridge(features[inside], gram, folds)  # type: ignore[arg-type]
     shown = outside[np.linspace(0, len(outside) - 1, min(SHOWN, len(outside))).astype(int)]
     sums: dict[str, np.ndarray] = {}

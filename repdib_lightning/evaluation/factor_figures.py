@@ -13,6 +13,7 @@ from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.data.outputs import check_output_file
 from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.evaluation.bundle_data import open_held_out
 from repdib_lightning.evaluation.bundles import bundle_of, display_name
 from repdib_lightning.evaluation.features import check_compatible, encode_rows, resolve_device
 from repdib_lightning.evaluation.group_drawing import mean_training_picture
@@ -76,7 +77,7 @@ def draw_factors(
         check_output_file(target / f"{figure}.png", "--output", ".png")
     drawn = open_redrawing(folder, data, groups=groups, count=pictures, split=split, seed=seed, device=device)
     files = figures_of(drawn, display_name(folder), chosen)
-    quality = _quality(drawn, EpisodeStore(data), split, seed)
+    quality = _quality(drawn, open_held_out(data, {str(folder): drawn.encoder.description}), split, seed)
     for figure, content in files.items():
         with whole_file(target / f"{figure}.png") as aside:
             aside.write_bytes(content)
@@ -111,7 +112,7 @@ def open_redrawing(
         raise UserError(f"--seed must be at least 0, is {seed}")
     place = resolve_device(device)
     encoder, decoder = load_encoder(bundle).to(place), load_decoder(bundle, place)
-    store = EpisodeStore(data)
+    store = open_held_out(data, {str(bundle): encoder.description})
     check_compatible(encoder, store, str(bundle))
     rows = _rows_of(store, split)
     some = np.random.default_rng(seed).permutation(rows)[:count]

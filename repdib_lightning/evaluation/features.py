@@ -60,7 +60,7 @@ def check_compatible(encoder: Encodes, store: EpisodeStore, bundle: str = "the e
                 f"{nearest(name, store.observations)}"
             )
         held = stacked(store.observations[name], encoder.spec.frame_stack)
-        if held != wanted:
+        if (held.shape, held.dtype) != (wanted.shape, wanted.dtype):
             stack = f" (stack of {encoder.spec.frame_stack})" if encoder.spec.frame_stack > 1 else ""
             raise UserError(
                 f"{store.path}: observation '{name}' is {_shown(held)}{stack}, {bundle} was trained on {_shown(wanted)}"

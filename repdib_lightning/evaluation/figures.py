@@ -15,7 +15,7 @@ from repdib_lightning.evaluation.tables import KINDS
 
 if TYPE_CHECKING:
     from repdib_lightning.evaluation.decoder import Drawings
-    from repdib_lightning.evaluation.probe import ProbeReport
+    from repdib_lightning.evaluation.probe_report import ProbeReport
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 """Okabe and Ito's palette, told apart by readers with any colour vision."""

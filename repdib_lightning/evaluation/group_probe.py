@@ -132,7 +132,7 @@ def measure_groups(
         fit=fit,
         score=~fit,
         seed=seed,
-        origins=store.row_episodes[rows],
+        origins=store.row_recordings[rows],
     )
     drawing = None
     if decoder is not None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,21 +13,22 @@ from torch import nn
 from tqdm import tqdm
 
 from repdib_lightning.data.episodes import EpisodeStore
-from repdib_lightning.data.files import whole_file
 from repdib_lightning.data.outputs import check_output_file
 from repdib_lightning.data.schema import FactorSpec
 from repdib_lightning.errors import UserError
+from repdib_lightning.evaluation.bundle_data import open_held_out
 from repdib_lightning.evaluation.bundles import bundle_of, display_name, protected_files
-from repdib_lightning.evaluation.codes import CodebookUse, FactorBits, codebook_use, factor_bits
-from repdib_lightning.evaluation.decoder import Drawings, PictureReport, check_pictures, measure_pictures
+from repdib_lightning.evaluation.codes import FactorBits, codebook_use, factor_bits
+from repdib_lightning.evaluation.decoder import Drawings, check_pictures, measure_pictures
 from repdib_lightning.evaluation.features import Encodes, check_compatible, encode_rows, resolve_device
 from repdib_lightning.evaluation.group_probe import GroupReport, check_grouped, measure_groups
+from repdib_lightning.evaluation.probe_report import FactorReport, ProbeReport
 from repdib_lightning.evaluation.probes import (
     DECODER,
     GROUPS,
     PROBES,
+    RECOGNITION,
     Half,
-    ProbeScore,
     Standardiser,
     as_target,
     chance,
@@ -37,102 +37,13 @@ from repdib_lightning.evaluation.probes import (
     one_thread,
 )
 from repdib_lightning.evaluation.samples import MOST, ProbeSamples
-from repdib_lightning.evaluation.splits import ProbeSplit, split_evaluation
-from repdib_lightning.evaluation.tables import report_table
+from repdib_lightning.evaluation.splits import ProbeSplit, rows_of, split_evaluation
 from repdib_lightning.word_lists import words
 
 if TYPE_CHECKING:
+    from repdib_lightning.evaluation.recognition import RecognitionReport
+    from repdib_lightning.evaluation.recognition_pass import Tells
     from repdib_lightning.export import FrozenEncoder
-
-Kind = Literal["endogenous", "exogenous"]
-
-
-@dataclass(frozen=True)
-class FactorReport:
-    """What a representation kept of one factor.
-
-    Attributes:
-        kind: ``endogenous`` (state: should be kept) or ``exogenous`` (noise: should be dropped).
-        metric: ``accuracy`` or ``R2``.
-        chance: score of a predictor that ignores the representation.
-        probes: probe name -> score.
-        bits: information in each group's code; None where nothing is quantised.
-        unseen: share of scored rows whose class the fit half lacks.
-    """
-
-    kind: Kind
-    metric: Literal["accuracy", "R2"]
-    chance: float
-    probes: dict[str, ProbeScore]
-    bits: FactorBits | None
-    unseen: float
-
-    @property
-    def best_bits(self) -> float | None:
-        """Bits in the most informative group."""
-        return max(self.bits.bits) if self.bits else None
-
-
-@dataclass(frozen=True)
-class ProbeReport:
-    """Every factor of a data set, read from one frozen encoder.
-
-    Attributes:
-        name: of the bundle; of the run where the bundle is runs/<name>/bundle.
-        data, fingerprint: the store, by file name and hash of its content.
-        features: M. groups: G. seed: of the probes.
-        fit_episodes, score_episodes: which evaluation episodes each half holds.
-        fit_rows, score_rows: how many rows each half holds.
-        factors: name -> report, endogenous first.
-        codebook: use of codes on all evaluation rows; None where nothing is quantised.
-        pictures: what the decoder probe drew again; None where it was not asked for.
-        grouped: what the groups hold and draw; None where it was not asked for.
-    """
-
-    name: str
-    data: str
-    fingerprint: str
-    features: int
-    groups: int
-    seed: int
-    fit_episodes: list[int]
-    score_episodes: list[int]
-    fit_rows: int
-    score_rows: int
-    factors: dict[str, FactorReport]
-    codebook: CodebookUse | None
-    pictures: PictureReport | None = None
-    grouped: GroupReport | None = None
-
-    def mean_kept(self, kind: Kind, probe: str) -> float | None:
-        """Mean *kept* over the factors of a kind; None if there is none, or none that varies."""
-        scores = [f.probes[probe].kept for f in self.factors.values() if f.kind == kind and probe in f.probes]
-        known = [kept for kept in scores if kept is not None]
-        return float(np.mean(known)) if known else None
-
-    @property
-    def probes(self) -> list[str]:
-        """Names of the probes that were fitted."""
-        return list(next(iter(self.factors.values())).probes)
-
-    def summary(self) -> dict[str, dict[str, float | None]]:
-        """Kind -> probe -> mean kept."""
-        kinds: tuple[Kind, Kind] = ("endogenous", "exogenous")
-        return {kind: {probe: self.mean_kept(kind, probe) for probe in self.probes} for kind in kinds}
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionaries, lists, strings, numbers and None (JSON)."""
-        grouped = None if self.grouped is None else self.grouped.to_dict()
-        return {**asdict(replace(self, grouped=None)), "grouped": grouped, "summary": self.summary()}
-
-    def write(self, path: Path) -> None:
-        """Write JSON; the file is whole or absent. Raises UserError if the folder cannot be written to."""
-        with whole_file(path) as aside:
-            aside.write_text(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
-
-    def table(self) -> str:
-        """The plain text table that the terminal shows."""
-        return report_table(self)
 
 
 @dataclass(frozen=True)
@@ -164,13 +75,16 @@ def probe_bundle(
 ) -> ProbeReport:
     """Probe an exported encoder for every factor of a data set, and write the result as JSON.
 
+    What the bundle held out by a factor, such as subjects, are the evaluation episodes here too.
+
     Args:
         bundle: folder of an exported encoder, or of a run that holds one.
         data: a store with factors and at least two evaluation episodes.
         output: the JSON file (.json); ``probe.json`` in the bundle by default.
         samples: also keep some latents, their factors and drawn pictures in this file (.npz), for figures.
         probes: ``linear``, ``mlp``, ``decoder`` (draws the pictures again from the latent), ``groups`` (what each group
-            of codes holds; with the bundle's own decoder also what it draws), or several between commas.
+            of codes holds; with the bundle's own decoder also what it draws), ``recognition`` (scores the bundle's own
+            classifier, also with modalities missing), or several between commas.
         groups: for ``groups``, how many to cut a latent into that is not quantised.
         clusters: for ``groups``, how many codes k-means gives each part of such a latent; 512 by default, and at most
             one for 8 training rows.
@@ -179,8 +93,8 @@ def probe_bundle(
         progress: show progress bars (on a terminal).
 
     Raises:
-        UserError: bad bundle or data, observations that do not match, no factors, too few evaluation episodes, or an
-            output that is no .json file, cannot be written or would replace what is read.
+        UserError: bad bundle or data, observations or classes that do not match, no factors, too few evaluation
+            episodes, or an output that is no .json file, cannot be written or would replace what is read.
     """
     chosen = check_options(probes, seed, groups, clusters)
     folder = bundle_of(Path(bundle))
@@ -189,16 +103,19 @@ def probe_bundle(
     check_output_file(target, "--output", ".json", [Path(data), *protected_files(folder)])
     if samples is not None:
         check_output_file(Path(samples), "--samples", ".npz", [Path(data)])
-    store = open_for_probing(data, chosen)
+    store = open_for_probing(data, chosen, {str(folder): encoder.description})
     check_compatible(encoder, store, str(folder))
     if GROUPS in chosen:
         check_grouped(encoder, groups)
+    classifier = load_to_recognise(folder, encoder, store) if RECOGNITION in chosen else None
     encoded = encode_evaluation(encoder, store, device=encoder.device, progress=progress)
     name = display_name(folder)
     report, drawings = probe_encoded(encoded, store, name=name, probes=chosen, seed=seed, progress=progress)
     if GROUPS in chosen:
         grouped = probe_groups(encoder, folder, store, groups=groups, clusters=clusters, seed=seed, progress=progress)
         report = replace(report, grouped=grouped)
+    if classifier is not None:
+        report = replace(report, recognition=probe_recognition(encoder, classifier, store, progress=progress))
     if samples is not None:
         draw_samples(encoded, store, drawings).write(Path(samples))
     report.write(target)
@@ -220,6 +137,25 @@ def probe_groups(
 
     decoder = load_decoder(bundle, encoder.device) if "decoder" in encoder.description else None
     return measure_groups(encoder, decoder, store, groups=groups, clusters=clusters, seed=seed, progress=progress)
+
+
+def load_to_recognise(bundle: Path, encoder: FrozenEncoder, store: EpisodeStore) -> Tells:
+    """The classifier of a bundle, beside its encoder. Raises UserError if there is none, or it knows other classes."""
+    from repdib_lightning.evaluation.recognition import checked_labels
+    from repdib_lightning.export import load_classifier
+
+    classifier = load_classifier(bundle, encoder.device)
+    checked_labels(classifier, store, rows_of(store, store.episodes("evaluation")), str(bundle))
+    return classifier
+
+
+def probe_recognition(
+    encoder: FrozenEncoder, classifier: Tells, store: EpisodeStore, *, progress: bool = True
+) -> RecognitionReport:
+    """Score the bundle's own classifier; torchmetrics is imported only here."""
+    from repdib_lightning.evaluation.recognition import measure_recognition
+
+    return measure_recognition(encoder, classifier, store, device=encoder.device, progress=progress)
 
 
 def draw_samples(encoded: Encoded, store: EpisodeStore, drawings: Drawings | None) -> ProbeSamples:
@@ -258,14 +194,16 @@ def load_for_probing(bundle: Path, device: str) -> FrozenEncoder:
     return load_encoder(bundle).to(resolve_device(device))
 
 
-def open_for_probing(data: Path, probes: Sequence[str] = PROBES) -> EpisodeStore:
-    """Open a store and check that it can be probed.
+def open_for_probing(
+    data: Path, probes: Sequence[str] = PROBES, bundles: Mapping[str, Mapping[str, Any]] | None = None
+) -> EpisodeStore:
+    """Open a store, split as bundles were trained (name -> ``config.json``), and check that it can be probed.
 
     Raises:
-        UserError: it cannot be read, has no factors, NaN in one, too few evaluation episodes, or (for ``decoder``) no
-            pictures.
+        UserError: it cannot be read, lacks what the bundles held out, has no factors, NaN in one, too few evaluation
+            episodes, or (for ``decoder``) no pictures.
     """
-    store = EpisodeStore(data)
+    store = open_held_out(data, bundles) if bundles else EpisodeStore(data)
     if DECODER in probes:
         check_pictures(store)
     split_evaluation(store)
@@ -302,16 +240,16 @@ def probe_encoded(
 ) -> tuple[ProbeReport, Drawings | None]:
     """Probe latents for every factor of their store, the state's factors first; with ``decoder``, for the pictures."""
     split = encoded.split
-    rows, episodes = split.rows, store.row_episodes[split.rows]
-    in_fit = np.isin(episodes, split.fit)
+    rows, recordings = split.rows, store.row_recordings[split.rows]
+    in_fit = np.isin(store.row_episodes[rows], split.fit)
     features = Standardiser(encoded.latents[in_fit])(encoded.latents)
     reports = {}
-    by_factor = tuple(probe for probe in probes if probe not in (DECODER, GROUPS))
+    by_factor = tuple(probe for probe in probes if probe in PROBES)
     ordered = sorted(store.factors.items(), key=lambda item: (item[1].kind, item[0]))
     for factor, spec in tqdm(ordered, desc="probe", unit="factor", disable=None if progress else True, leave=False):
         target = as_target(store.gather(f"factors/{factor}", rows), spec)
-        fit = Half(features[in_fit], target[in_fit], episodes[in_fit])
-        score = Half(features[~in_fit], target[~in_fit], episodes[~in_fit])
+        fit = Half(features[in_fit], target[in_fit], recordings[in_fit])
+        score = Half(features[~in_fit], target[~in_fit], recordings[~in_fit])
         bits = None if encoded.codes is None else factor_bits(encoded.codes, target, seed)
         reports[factor] = _factor_report(spec, fit, score, by_factor, bits, seed)
     pictures, drawings = None, None

@@ -31,6 +31,11 @@ DECODER = "decoder"
 GROUPS = "groups"
 """The probe of groups of codes (:mod:`repdib_lightning.evaluation.group_probe`)."""
 
+RECOGNITION = "recognition"
+"""The probe of a bundle's own classifier (:mod:`repdib_lightning.evaluation.recognition`)."""
+
+KNOWN = (*PROBES, DECODER, GROUPS, RECOGNITION)
+
 RIDGE_PENALTIES = (10.0, *PENALTIES, 1e-5, 1e-6)
 ABSENT = -1e4
 """A logit so low that its class is never predicted, and small enough for float32."""
@@ -92,8 +97,8 @@ class Standardiser:
 def check_probes(probes: tuple[str, ...]) -> None:
     """Raises UserError if a probe is unknown or none is given."""
     for name in probes:
-        if name not in (*PROBES, DECODER, GROUPS):
-            raise UserError(f"probes: unknown probe '{name}', {nearest(name, (*PROBES, DECODER, GROUPS))}")
+        if name not in KNOWN:
+            raise UserError(f"probes: unknown probe '{name}', {nearest(name, KNOWN)}")
     if not set(probes) & set(PROBES):
         raise UserError(f"probes: at least one of the factors is needed, {nearest('', PROBES)}")
 

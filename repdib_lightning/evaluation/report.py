@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,18 +22,29 @@ from repdib_lightning.evaluation.decoder import Drawings
 from repdib_lightning.evaluation.features import check_compatible
 from repdib_lightning.evaluation.group_probe import check_grouped
 from repdib_lightning.evaluation.probe import (
+    RECOGNITION,
     Encoded,
-    ProbeReport,
     check_options,
     encode_evaluation,
     load_for_probing,
+    load_to_recognise,
     open_for_probing,
     probe_encoded,
     probe_groups,
+    probe_recognition,
 )
+from repdib_lightning.evaluation.probe_report import ProbeReport
 from repdib_lightning.evaluation.probes import GROUPS, PROBES
+from repdib_lightning.evaluation.recognition_confusion import confusion_matrix
+from repdib_lightning.evaluation.recognition_modalities import modality_bars
+from repdib_lightning.evaluation.recognition_tables import recognition_comparison, recognition_notes
 from repdib_lightning.evaluation.splits import rows_of
 from repdib_lightning.evaluation.tables import comparison_table, notes
+
+if TYPE_CHECKING:
+    from repdib_lightning.evaluation.recognition import RecognitionReport
+    from repdib_lightning.evaluation.recognition_pass import Tells
+    from repdib_lightning.export import FrozenEncoder
 
 SCATTERED = 2000
 STYLE = """
@@ -110,25 +121,50 @@ def compare(
     encoders = {name: load_for_probing(Path(bundle), device) for name, bundle in bundles.items()}
     for path in metrics.values():
         curves.read_curves(path)
-    store = open_for_probing(data, chosen)
+    named = {str(bundles[name]): encoder.description for name, encoder in encoders.items()}
+    store = open_for_probing(data, chosen, named)
     all_quantised = all(encoder.groups for encoder in encoders.values())
     cuts = {name: groups if all_quantised or not encoder.groups else None for name, encoder in encoders.items()}
     for name, encoder in encoders.items():
         check_compatible(encoder, store, str(bundles[name]))
         if GROUPS in chosen:
             check_grouped(encoder, cuts[name])
+    asked = encoders if RECOGNITION in chosen else {}
+    classifiers = {name: load_to_recognise(Path(bundles[name]), encoder, store) for name, encoder in asked.items()}
     runs = {}
     for name, encoder in encoders.items():
-        encoded = encode_evaluation(encoder, store, device=encoder.device, progress=progress)
-        report, drawings = probe_encoded(encoded, store, name=name, probes=chosen, seed=seed, progress=progress)
         place = Path(bundles[name])
-        if GROUPS in chosen:
-            grouped = probe_groups(encoder, place, store, groups=cuts[name], seed=seed, progress=progress)
-            report = replace(report, grouped=grouped)
-        runs[name] = RunResult(report, encoded, encoder.description, metrics.get(name), place, drawings)
+        options = {"seed": seed, "progress": progress}
+        found = _probed(name, encoder, classifiers.get(name), place, store, chosen, cuts[name], options)
+        runs[name] = replace(found, metrics=metrics.get(name))
     write_comparison(output, runs, store, title=title)
     reports = {name: run.report for name, run in runs.items()}
-    return "\n".join([comparison_table(reports).text(), "", *notes(reports)])
+    lines = [comparison_table(reports).text(), "", *notes(reports)]
+    recognised = _recognised(reports)
+    if recognised:
+        lines += ["", recognition_comparison(recognised).text(), "", *recognition_notes(recognised)]
+    return "\n".join(lines)
+
+
+def _probed(
+    name: str,
+    encoder: FrozenEncoder,
+    classifier: Tells | None,
+    bundle: Path,
+    store: EpisodeStore,
+    probes: tuple[str, ...],
+    groups: int | None,
+    options: dict[str, Any],
+) -> RunResult:
+    """One of the bundles that are compared."""
+    encoded = encode_evaluation(encoder, store, device=encoder.device, progress=options["progress"])
+    report, drawings = probe_encoded(encoded, store, name=name, probes=probes, **options)
+    if GROUPS in probes:
+        report = replace(report, grouped=probe_groups(encoder, bundle, store, groups=groups, **options))
+    if classifier is not None:
+        recognition = probe_recognition(encoder, classifier, store, progress=options["progress"])
+        report = replace(report, recognition=recognition)
+    return RunResult(report, encoded, encoder.description, bundle=bundle, drawings=drawings)
 
 
 def check_outputs(output: Path, inputs: Sequence[Path]) -> None:
@@ -196,6 +232,7 @@ def comparison_sections(runs: Mapping[str, RunResult], store: EpisodeStore) -> l
     reports = {name: run.report for name, run in runs.items()}
     sections = [
         Section("What was kept and dropped", _table_body(reports)),
+        *_recognition_sections(_recognised(reports)),
         Section("Kept of each factor", picture(figures.kept_bars(reports), "bars of kept, state apart from noise")),
         Section("What was trained", _trained_body(runs)),
     ]
@@ -215,6 +252,23 @@ def comparison_sections(runs: Mapping[str, RunResult], store: EpisodeStore) -> l
 def _table_body(reports: dict[str, ProbeReport]) -> str:
     lines = "<br>".join(html.escape(line) for line in notes(reports))
     return f'<div class="wide">{comparison_table(reports).html()}</div>\n<p class="note">{lines}</p>'
+
+
+def _recognised(reports: Mapping[str, ProbeReport]) -> dict[str, RecognitionReport]:
+    """What each classifier recognises; empty unless all were asked."""
+    found = {name: report.recognition for name, report in reports.items() if report.recognition is not None}
+    return found if len(found) == len(reports) else {}
+
+
+def _recognition_sections(reports: dict[str, RecognitionReport]) -> list[Section]:
+    if not reports:
+        return []
+    lines = "<br>".join(html.escape(line) for line in recognition_notes(reports))
+    table = f'<div class="wide">{recognition_comparison(reports).html()}</div>\n<p class="note">{lines}</p>'
+    needed = modality_bars(reports)
+    bars = [] if needed is None else [picture(needed, "bars of macro F1 without each modality and with each alone")]
+    matrix = picture(confusion_matrix(reports), "confusion matrix: a row a true class, a column what was recognised")
+    return [Section("What is recognised", "\n".join([table, *bars, matrix]))]
 
 
 def _trained_body(runs: Mapping[str, RunResult]) -> str:

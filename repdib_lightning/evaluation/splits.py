@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from repdib_lightning.data.clips import holds_clips
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.errors import UserError
 
 
 @dataclass(frozen=True)
 class ProbeSplit:
-    """Two disjoint halves of the evaluation episodes.
+    """Two disjoint halves of the evaluation episodes, which share no recording.
 
     Attributes:
         fit, score: (E,) int64 episode indices.
@@ -31,22 +32,41 @@ class ProbeSplit:
 
 
 def split_evaluation(store: EpisodeStore) -> ProbeSplit:
-    """Deal the evaluation episodes alternately into a fit and a score half, so that a slow drift covers both.
+    """Deal the evaluation recordings alternately into a fit and a score half, so that a slow drift covers both.
 
-    The paper names no hold-out split for its probes; neighbouring frames are near copies of each other, so only
-    whole episodes are held out.
+    Recordings of clips are dealt in a random order, always the same: files list activities in turn, and every second
+    clip would be of every second activity.
+
+    A recording is an episode, or all episodes that were cut of it. The paper names no hold-out split for its probes;
+    neighbouring frames are near copies of each other, so only whole recordings are held out.
 
     Raises:
-        UserError: the store has fewer than two evaluation episodes.
+        UserError: the store has fewer than two evaluation recordings, or the fit half a single row, of which no inner
+            split can be made.
     """
     episodes = store.episodes("evaluation")
-    if len(episodes) < 2:
+    number, of_episode = np.unique(store.recordings[episodes], return_inverse=True)
+    cut = "episodes/recording" in store
+    whole = "evaluation recordings" if cut else "evaluation episodes"
+    if len(number) < 2:
         raise UserError(
-            f"{store.path}: a probe needs at least 2 evaluation episodes (one to fit, one to score), has "
-            f"{len(episodes)} of {len(store.starts)}; mark more in 'episodes/evaluation'"
+            f"{store.path}: a probe needs at least 2 {whole} (one to fit, one to score), has "
+            f"{len(number)} of {len(np.unique(store.recordings))}; {_hold_out_more(store)}"
         )
-    fit, score = episodes[0::2], episodes[1::2]
-    return ProbeSplit(fit, score, rows_of(store, fit), rows_of(store, score))
+    if holds_clips(store):
+        of_episode = np.random.default_rng(0).permutation(len(number))[of_episode]
+    fit, score = episodes[of_episode % 2 == 0], episodes[of_episode % 2 == 1]
+    split = ProbeSplit(fit, score, rows_of(store, fit), rows_of(store, score))
+    if len(split.fit_rows) < 2:
+        raise UserError(
+            f"{store.path}: a probe needs at least 2 rows to fit, has 1 (of {len(episodes)} evaluation episodes "
+            f"every second is scored); {_hold_out_more(store)}"
+        )
+    return split
+
+
+def _hold_out_more(store: EpisodeStore) -> str:
+    return "mark more in 'episodes/evaluation'" if store.held_out is None else "name more values in held_out"
 
 
 def rows_of(store: EpisodeStore, episodes: np.ndarray) -> np.ndarray:
@@ -56,12 +76,12 @@ def rows_of(store: EpisodeStore, episodes: np.ndarray) -> np.ndarray:
 
 
 def episode_folds(episodes: np.ndarray, folds: int = 4) -> list[np.ndarray]:
-    """Inner validation sets that hold out whole episodes.
+    """Inner validation sets that hold out whole episodes, or recordings.
 
-    A single episode cannot be split by episodes; its rows are then cut into contiguous blocks.
+    A single one cannot be split that way; its rows are then cut into contiguous blocks.
 
     Args:
-        episodes: (n,) episode of each row, rows in the order of the store.
+        episodes: (n,) episode, or recording, of each row, rows in the order of the store.
         folds: at most this many; fewer where there are fewer episodes.
 
     Returns:

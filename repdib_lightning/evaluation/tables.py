@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from repdib_lightning.evaluation.probe import Kind, ProbeReport
+    from repdib_lightning.evaluation.probe_report import Kind, ProbeReport
 
 KINDS: dict[Kind, str] = {"endogenous": "state", "exogenous": "noise"}
 """What each kind of factor is called in front of a reader."""

@@ -20,6 +20,7 @@ _REACHED = (
     *("mean_return", "mean_success", "final_success", "mean_coverage"),
 )
 _NEEDED = ("steps_to_solve", "moves")
+_NEITHER_OF_RECOGNITION = ("weight", "perplexity")
 _NEITHER_OF_GROUPS = ("share", "drawn", "moved", "moved_unswapped", "psnr_lost_most", "psnr_lost_least")
 
 
@@ -65,8 +66,11 @@ def direction(measure: str, factors: dict[str, str]) -> Direction:
         return ""
     if measure.startswith("groups/"):
         return "" if measure.rpartition("/")[2] in _NEITHER_OF_GROUPS else "up"
+    if measure.startswith("recognition/"):
+        return "" if measure.split("/")[1] in _NEITHER_OF_RECOGNITION else "up"
     if measure.startswith("val/"):
-        return "up" if measure.endswith("accuracy") else "down" if measure == "val/loss" or "/raw/" in measure else ""
+        reached = measure.endswith("accuracy") or measure.startswith("val/f1")
+        return "up" if reached else "down" if measure == "val/loss" or "/raw/" in measure else ""
     first, target, quantity = measure.split("/", 2)
     if first in AGENTS:
         return "up" if quantity in _REACHED else "down" if quantity in _NEEDED else ""

@@ -1,4 +1,4 @@
-"""The paper's table beside ours, in both readings of "error"; and claims held against the numbers."""
+"""The paper's table beside ours, its "error" in both readings; and claims held against the numbers."""
 
 from __future__ import annotations
 
@@ -12,20 +12,24 @@ from repdib_lightning.experiments import statistics
 from repdib_lightning.experiments.results import Results
 from repdib_lightning.experiments.statistics import Estimate
 from repdib_lightning.experiments.suite import Claim, Grid, HeadlineRow
+from repdib_lightning.experiments.suite_measures import is_whole
 
 READINGS = {"error": "error of predicting it", "kept": "how much of it is kept"}
 """Last part of a measure -> what a relative "error" can mean."""
+
+WHOLE = ""
+"""The reading of a whole measure, which is shown as it is."""
 
 FEWEST_SEEDS = 5
 """Below, a bootstrap interval is little more than the range of the seeds, and no claim is judged by it."""
 
 TIE = 0.01
-"""Relative values of the paper that differ by less than this are taken as equal when orders are compared."""
+"""Values of the paper that differ by less than this are taken as equal when orders are compared."""
 
 
 @dataclass(frozen=True)
 class HeadlineCell:
-    """One setting in one reading: relative to the baseline (None where the baseline is zero), and as it is."""
+    """A setting in one reading: relative to the baseline (None where that is zero, or the measure whole), and as is."""
 
     relative: Estimate | None
     absolute: Estimate
@@ -36,9 +40,9 @@ class HeadlineLine:
     """One row of the paper's table in one reading.
 
     Attributes:
-        row: of the suite. reading: a key of READINGS. cells: setting -> numbers.
+        row: of the suite. reading: a key of READINGS, or WHOLE. cells: setting -> numbers.
         agrees: whether every pair of settings that the paper tells apart has the same order here; None where the paper
-            tells none apart, or nothing relative can be said.
+            tells none apart, or there is nothing here to compare.
     """
 
     row: HeadlineRow
@@ -48,9 +52,22 @@ class HeadlineLine:
 
 
 def headline(results: Results) -> list[HeadlineLine]:
-    """All rows in both readings, on the first grid."""
-    grid = results.suite.grids[0]
-    return [_line(results, grid, row, reading) for row in results.suite.headline for reading in READINGS]
+    """All rows: relative ones in both readings, on the first grid; whole measures on their own."""
+    lines = []
+    for row in results.suite.headline:
+        grid = results.suite.grid(row.grid)
+        if is_whole(row.measure):
+            lines.append(_whole_line(results, grid, row))
+        else:
+            lines += [_line(results, grid, row, reading) for reading in READINGS]
+    return lines
+
+
+def _whole_line(results: Results, grid: Grid, row: HeadlineRow) -> HeadlineLine:
+    _check_measure(results, grid, row.measure, f"headline.{row.label}")
+    found = {setting.name: list(results.values(setting, row.measure).values()) for setting in grid.settings}
+    cells = {name: HeadlineCell(None, statistics.mean(np.array(values))) for name, values in found.items() if values}
+    return HeadlineLine(row, WHOLE, cells, _agrees(row, {name: cell.absolute for name, cell in cells.items()}))
 
 
 def _line(results: Results, grid: Grid, row: HeadlineRow, reading: str) -> HeadlineLine:
@@ -62,17 +79,16 @@ def _line(results: Results, grid: Grid, row: HeadlineRow, reading: str) -> Headl
         ours, theirs = results.paired(setting, baseline, measure)
         if len(ours):
             cells[setting.name] = HeadlineCell(statistics.paired_ratio(ours, theirs), statistics.mean(ours))
-    return HeadlineLine(row, reading, cells, _agrees(row, cells))
+    relative = {name: cell.relative for name, cell in cells.items() if cell.relative is not None}
+    return HeadlineLine(row, reading, cells, _agrees(row, relative))
 
 
-def _agrees(row: HeadlineRow, cells: dict[str, HeadlineCell]) -> bool | None:
+def _agrees(row: HeadlineRow, ours: dict[str, Estimate]) -> bool | None:
     told = []
-    for first, second in itertools.combinations([name for name in row.paper if name in cells], 2):
+    for first, second in itertools.combinations([name for name in row.paper if name in ours], 2):
         gap = row.paper[first] - row.paper[second]
-        ours = [cells[name].relative for name in (first, second)]
-        if abs(gap) < TIE or ours[0] is None or ours[1] is None:
-            continue
-        told.append((ours[0].value - ours[1].value) * gap > 0)
+        if abs(gap) >= TIE:
+            told.append((ours[first].value - ours[second].value) * gap > 0)
     return all(told) if told else None
 
 

@@ -14,6 +14,7 @@ import yaml
 from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation.curves import read_curves
 from repdib_lightning.evaluation.tables import KINDS
+from repdib_lightning.experiments.suite_measures import RECOGNITION_PARTS, RECOGNITION_SCORES
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,11 @@ def collect_measures(run: Path, probe: Path | None, outcomes: Mapping[str, Path]
     - ``decoder/background/kept``, ``.../error``, and the same for ``agent``: of the pictures
       (:mod:`repdib_lightning.evaluation.decoder`);
     - ``groups/...``: what the groups hold and draw (:mod:`repdib_lightning.evaluation.group_probe`);
+    - ``recognition/f1_macro``, ``.../f1_micro``, ``.../f1_weighted``, ``.../accuracy``: of the classifier, on all
+      held-out clips; ``recognition/f1/CLASS``; ``recognition/without/MODALITY`` and ``.../only/MODALITY``: macro F1
+      with it, or all others, missing; ``recognition/weight/MODALITY``: its mean weight;
+      ``recognition/perplexity/MODALITY``, or ``.../fused``: of its codes
+      (:mod:`repdib_lightning.evaluation.recognition`);
     - ``codes/used``, ``codes/perplexity``: means over the groups, on held-out episodes;
     - ``val/...``: what the last validation logged;
     - ``AGENT/NAME/...``: of each fine-tuning; what it says null of is left out.
@@ -118,10 +124,22 @@ def _probed(report: dict[str, Any]) -> dict[str, float]:
             _add(found, f"decoder/{region}/{name}", score[name])
     for name, value in ((report.get("grouped") or {}).get("figures") or {}).items():
         _add(found, f"groups/{name}", value)
+    if report.get("recognition") is not None:
+        _add_recognition(found, report["recognition"])
     if report["codebook"] is not None:
         _add(found, "codes/used", float(np.mean(report["codebook"]["used"])))
         _add(found, "codes/perplexity", float(np.mean(report["codebook"]["perplexity"])))
     return found
+
+
+def _add_recognition(found: dict[str, float], record: dict[str, Any]) -> None:
+    without = {name: scores["f1_macro"] for name, scores in record["without"].items()}
+    read = (record["f1"], without, record["only"], record["attention"], record["perplexity"])
+    for score in RECOGNITION_SCORES:
+        _add(found, f"recognition/{score}", record[score])
+    for part, values in zip(RECOGNITION_PARTS, read, strict=True):
+        for name, value in values.items():
+            _add(found, f"recognition/{part}/{name}", value)
 
 
 def _add(found: dict[str, float], name: str, value: float | None) -> None:

@@ -20,15 +20,17 @@ from repdib_lightning.experiments.curves import Band, bands, finetune_bands, wri
 from repdib_lightning.experiments.film_part import film_parts
 from repdib_lightning.experiments.finetune_parts import finetune_parts, training_only
 from repdib_lightning.experiments.group_part import group_parts
-from repdib_lightning.experiments.headline import headline, verdicts
+from repdib_lightning.experiments.headline import WHOLE, HeadlineLine, headline, verdicts
 from repdib_lightning.experiments.maze_maps import Maps, mean_maps, write_maps
 from repdib_lightning.experiments.overview import overview_parts
 from repdib_lightning.experiments.page import Part, as_markdown, as_section, facts_of
 from repdib_lightning.experiments.points import PROBE_FILE, SAMPLES_FILE
+from repdib_lightning.experiments.recognition_part import recognition_parts
 from repdib_lightning.experiments.results import Results, load_results
 from repdib_lightning.experiments.run import RUNS, chosen_points
 from repdib_lightning.experiments.suite import Grid
 from repdib_lightning.experiments.suite_file import read_suite
+from repdib_lightning.experiments.suite_measures import RECOGNITION_PROBE
 from repdib_lightning.rl import AGENTS
 
 RESULTS = Path("results")
@@ -61,7 +63,7 @@ def report_suite(
     all_maps = {grid.name: mean_maps(results, grid) for grid in plan.grids}
     found = {grid.name: (summaries(results, grid), differences(results, grid)) for grid in plan.grids}
     parts = [*_headline_part(results), *_grid_parts(results, found, all_bands, all_maps), *_latent_parts(results)]
-    parts = [*overview_parts(results), *parts, *group_parts(results), *film_parts(results)]
+    parts = [*overview_parts(results), *parts, *group_parts(results), *recognition_parts(results), *film_parts(results)]
     _write(folder, results, parts, all_bands)
     if any(all_maps.values()):
         write_maps(folder / "maps.json", all_maps)
@@ -75,22 +77,29 @@ def report_suite(
 def _headline_part(results: Results) -> list[Part]:
     suite = results.suite
     lines, found = headline(results), verdicts(results)
-    shown = [tables.headline_table(results, lines), tables.absolute_table(results, lines)] if lines else []
+    shown = tables.headline_tables(results, lines)
     if found:
         shown.append(tables.claims_table(found, suite))
     if not shown:
         return []
-    grid = suite.grids[0]
-    sentences = [
+    if not lines:
+        return [Part("Claims", [], shown, {})]
+    return [Part("The paper's table, and ours", _headline_sentences(lines, suite.grids[0]), shown, {})]
+
+
+def _headline_sentences(lines: Sequence[HeadlineLine], grid: Grid) -> list[str]:
+    whole = ["The paper's numbers are of its own data: their order can be compared with ours, not their size."]
+    relative = [
         f"Relative to '{grid.baseline}': mean over mean, seeds in pairs, with a 95 % bootstrap interval over seeds.",
         'The paper prints a relative "error" and does not define it. Two readings: the error of a probe that predicts '
         "the factor (1 - R2; 1 - accuracy; the squared error of drawn pixels over that of the mean picture), which is "
         "high where noise was dropped; and how much of it is kept, (score - chance) / (1 - chance), then low.",
+    ]
+    return [
+        *(whole if any(line.reading == WHOLE for line in lines) else []),
+        *(relative if any(line.reading != WHOLE for line in lines) else []),
         "Paper's order: whether any two settings that the paper tells apart, by 0.01 or more, come in the same order.",
     ]
-    if not lines:
-        return [Part("Claims", [], shown, {})]
-    return [Part("The paper's table, and ours", sentences, shown, {})]
 
 
 def _grid_parts(
@@ -132,8 +141,9 @@ def table_measures(results: Results, grid: Grid) -> list[str]:
 
 
 def _drawn_measures(measures: Sequence[str]) -> list[str]:
-    """Kept, reached by fine-tuning, and codes in use."""
+    """Kept, reached by fine-tuning, recognised, and codes in use."""
     reached = [name for name in measures if name.partition("/")[0] in AGENTS]
+    reached += [name for name in measures if name.startswith(f"{RECOGNITION_PROBE}/") and name.count("/") == 1]
     codes = [name for name in measures if name.startswith("codes/used")]
     return [name for name in measures if name.endswith("/kept")] + reached + codes
 

@@ -129,13 +129,17 @@ class HeadlineRow:
     """A row of a paper's table, and what is measured for it here.
 
     Attributes:
-        label: as the report prints it. measure: without its last part (``linear/time_step``): error and kept are shown.
-        paper: setting -> printed value, relative to the baseline.
+        label: as the report prints it.
+        measure: of a probe of factors or of the pictures without its last part (``linear/time_step``), then error and
+            kept are shown, relative to the baseline; or a whole one (``recognition/f1_macro``), then shown as it is.
+        paper: setting -> printed value; relative to the baseline, or in the unit of a whole measure.
+        grid: of a whole measure; empty for the first one.
     """
 
     label: str
     measure: str
     paper: Mapping[str, float]
+    grid: str = ""
 
 
 @dataclass(frozen=True)
@@ -183,6 +187,7 @@ class Suite:
         overview: measures that the report draws over all grids, first of all.
         films: places (``grid/setting``) of the settings whose policies are shown in films.
         drawn_groups: places of the settings of which the report shows what each group draws.
+        recognised: places of the settings of which the report shows what is recognised, and by which modality.
     """
 
     name: str
@@ -207,6 +212,7 @@ class Suite:
     films: tuple[str, ...] = ()
     overview: tuple[str, ...] = ()
     drawn_groups: tuple[str, ...] = ()
+    recognised: tuple[str, ...] = ()
 
     def grid(self, name: str) -> Grid:
         """The grid of this name; the first one for an empty name."""

@@ -74,7 +74,7 @@ def read_suite(name: str | Path) -> Suite:
         probe=check_keys(file, "probe", tree.get("probe") or {}, set(PROBE_OPTIONS)),
         slurm=mapping(file, "slurm", tree.get("slurm")),
         grids=built,
-        headline=tuple(_headline_row(file, *item, known) for item in mapping(file, "headline", headline).items()),
+        headline=tuple(_headline_row(file, *item, built) for item in mapping(file, "headline", headline).items()),
         claims=tuple(_claim(file, *item, built) for item in mapping(file, "claims", tree.get("claims")).items()),
         measures=words(file, "measures", tree.get("measures", [])),
         overview=words(file, "overview", tree.get("overview", [])),
@@ -84,6 +84,7 @@ def read_suite(name: str | Path) -> Suite:
         finetune_curves=words(file, "finetune_curves", tree.get("finetune_curves", ["eval/success"])),
         films=words(file, "films", tree.get("films", []), places),
         drawn_groups=words(file, "drawn_groups", tree.get("drawn_groups", []), places),
+        recognised=words(file, "recognised", tree.get("recognised", []), places),
         maps=words(file, "maps", tree.get("maps", []), [s.name for grid in built for s in grid.settings]),
     )
     check_measures(suite)
@@ -132,14 +133,15 @@ def _show(file: Path, names: tuple[str, ...], grid: Grid) -> tuple[str, ...]:
     return names
 
 
-def _headline_row(file: Path, label: str, content: Any, settings: Sequence[str]) -> HeadlineRow:
+def _headline_row(file: Path, label: str, content: Any, grids: Sequence[Grid]) -> HeadlineRow:
     key = f"headline.{label}"
-    check_keys(file, key, content, {"measure", "paper"})
+    check_keys(file, key, content, {"measure", "paper", "grid"})
+    settings = _settings_of(file, key, content, grids)
     paper = mapping(file, f"{key}.paper", content.get("paper"))
     for setting, value in paper.items():
         check_choice(file, f"{key}.paper", setting, settings)
         check_number(file, f"{key}.paper.{setting}", value)
-    return HeadlineRow(label, str(content.get("measure", "")), paper)
+    return HeadlineRow(label, str(content.get("measure", "")), paper, content.get("grid", ""))
 
 
 def _claim(file: Path, text: str, content: Any, grids: Sequence[Grid]) -> Claim:
@@ -148,10 +150,7 @@ def _claim(file: Path, text: str, content: Any, grids: Sequence[Grid]) -> Claim:
     for needed in ("setting", "measure"):
         if needed not in content:
             raise UserError(f"{file}: {key}.{needed} is missing")
-    by_name = {grid.name: grid for grid in grids}
-    grid = content.get("grid", grids[0].name)
-    check_choice(file, f"{key}.grid", grid, list(by_name))
-    settings = [setting.name for setting in by_name[grid].settings]
+    settings = _settings_of(file, key, content, grids)
     check_choice(file, f"{key}.setting", content["setting"], settings)
     if "than" in content:
         check_choice(file, f"{key}.than", content["than"], settings)
@@ -163,3 +162,11 @@ def _claim(file: Path, text: str, content: Any, grids: Sequence[Grid]) -> Claim:
     for bound in bounds:
         check_number(file, key, bound)
     return Claim(text, **content)
+
+
+def _settings_of(file: Path, key: str, content: Mapping[str, Any], grids: Sequence[Grid]) -> list[str]:
+    """Names of the settings of the grid that a claim or a row is about: the first one without ``grid``."""
+    by_name = {grid.name: grid for grid in grids}
+    grid = content.get("grid", grids[0].name)
+    check_choice(file, f"{key}.grid", grid, list(by_name))
+    return [setting.name for setting in by_name[grid].settings]

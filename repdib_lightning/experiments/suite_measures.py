@@ -7,10 +7,10 @@ from typing import Any
 
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.experiments.merging import REPLACED
-from repdib_lightning.experiments.suite import Grid, Suite
+from repdib_lightning.experiments.suite import Grid, HeadlineRow, Suite
 from repdib_lightning.word_lists import words
 
-FACTOR_PROBES, PICTURE_PROBE, GROUP_PROBE = ("linear", "mlp"), "decoder", "groups"
+FACTOR_PROBES, PICTURE_PROBE, GROUP_PROBE, RECOGNITION_PROBE = ("linear", "mlp"), "decoder", "groups", "recognition"
 """What ``probe --probes`` takes; written out, since the probes themselves import torch."""
 
 QUANTITIES = {**dict.fromkeys(FACTOR_PROBES, ("kept", "error")), PICTURE_PROBE: ("kept", "error", "rmse")}
@@ -23,6 +23,10 @@ GROUP_SCORES = (
 )
 GROUP_FACTOR_SCORES = ("share", "share_gap", "explicitness", "judged", "drawn", "moved", "moved_gap", "moved_unswapped")
 """What the probe ``groups`` measures of a latent, and of each factor."""
+
+RECOGNITION_SCORES = ("f1_macro", "f1_micro", "f1_weighted", "accuracy")
+RECOGNITION_PARTS = ("f1", "without", "only", "weight", "perplexity")
+"""What the probe ``recognition`` measures, and of each activity or modality."""
 
 QUANTISERS = ("VectorQuantiser", "RepDIB")
 """Bottlenecks that take ``groups``; written out, since they import torch."""
@@ -46,7 +50,24 @@ def check_measures(suite: Suite) -> None:
     for claim in suite.claims:
         _check(suite, f"claims.{claim.text}.measure", claim.measure, [suite.grid(claim.grid)])
     for row in suite.headline:
-        _check(suite, f"headline.{row.label}.measure", f"{row.measure}/kept", suite.grids[:1])
+        _check_headline(suite, row)
+
+
+def is_whole(measure: str) -> bool:
+    """Whether a measure is one number of a point, and not a probe's two readings of a factor."""
+    first, last = str(measure).partition("/")[0], str(measure).rpartition("/")[2]
+    return first not in QUANTITIES or last in QUANTITIES[first]
+
+
+def _check_headline(suite: Suite, row: HeadlineRow) -> None:
+    whole = is_whole(row.measure)
+    if row.grid and not whole:
+        raise UserError(
+            f"{suite.file}: headline.{row.label}.grid: '{row.measure}' is read relative to the baseline of the first "
+            f"grid; leave 'grid' out, or name a whole measure such as {row.measure}/kept"
+        )
+    measure = row.measure if whole else f"{row.measure}/kept"
+    _check(suite, f"headline.{row.label}.measure", measure, [suite.grid(row.grid)])
 
 
 def probes_of(suite: Suite, grid: Grid) -> tuple[str, ...]:
@@ -56,7 +77,7 @@ def probes_of(suite: Suite, grid: Grid) -> tuple[str, ...]:
 
 
 def _check_probes(suite: Suite) -> None:
-    known = (*FACTOR_PROBES, PICTURE_PROBE, GROUP_PROBE)
+    known = (*FACTOR_PROBES, PICTURE_PROBE, GROUP_PROBE, RECOGNITION_PROBE)
     for grid in suite.grids:
         chosen = probes_of(suite, grid)
         where = f"{suite.file}: " + ("probe.probes" if grid.probe is None else f"grids.{grid.name}.probe.probes")
@@ -127,5 +148,9 @@ def _check(suite: Suite, key: str, measure: str, grids: Sequence[Grid]) -> None:
         kind, known_last = ("of a factor ", GROUP_FACTOR_SCORES) if "/" in rest else ("", GROUP_SCORES)
         if last not in known_last:
             raise UserError(f"{where}: '{last}' {kind}is not measured, {nearest(last, known_last)}")
+    if first == RECOGNITION_PROBE:
+        kind, known_first = ("of a class or modality ", RECOGNITION_PARTS) if "/" in rest else ("", RECOGNITION_SCORES)
+        if name not in known_first:
+            raise UserError(f"{where}: '{name}' {kind}is not measured, {nearest(name, known_first)}")
     if first in QUANTITIES and last not in QUANTITIES[first]:
         raise UserError(f"{where}: must end in {' or '.join(QUANTITIES[first])}, {nearest(last, QUANTITIES[first])}")

@@ -9,13 +9,14 @@ from pathlib import Path
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.evaluation.tables import Table, number
 from repdib_lightning.experiments.comparison import Difference, Summary, direction
-from repdib_lightning.experiments.headline import FEWEST_SEEDS, READINGS, HeadlineLine, Verdict
+from repdib_lightning.experiments.headline import FEWEST_SEEDS, READINGS, WHOLE, HeadlineLine, Verdict
 from repdib_lightning.experiments.results import Results
 from repdib_lightning.experiments.statistics import Estimate
 from repdib_lightning.experiments.suite import Grid, Suite
 
 ARROWS = {"up": " ↑", "down": " ↓", "": ""}
 NOTHING = "-"
+_VERDICTS = {True: "yes", False: "no", None: NOTHING}
 
 
 def markdown(table: Table) -> str:
@@ -36,6 +37,26 @@ def interval(estimate: Estimate | None, digits: int = 3, signed: bool = False) -
     return f"{shown} [{number(estimate.low, digits)}, {number(estimate.high, digits)}]"
 
 
+def headline_tables(results: Results, lines: Sequence[HeadlineLine]) -> list[Table]:
+    """The paper's rows beside ours: whole measures as they are, then what is relative to the baseline, and absolute."""
+    whole = [line for line in lines if line.reading == WHOLE]
+    relative = [line for line in lines if line.reading != WHOLE]
+    shown = [whole_table(results, whole)] if whole else []
+    return [*shown, headline_table(results, relative), absolute_table(results, relative)] if relative else shown
+
+
+def whole_table(results: Results, lines: Sequence[HeadlineLine]) -> Table:
+    """The paper's rows: printed values, then ours in the same unit."""
+    grids = [results.suite.grid(line.row.grid) for line in lines]
+    settings = list(dict.fromkeys(setting.name for grid in grids for setting in grid.settings))
+    rows = []
+    for line in lines:
+        paper = [number(line.row.paper[s], 4) if s in line.row.paper else NOTHING for s in settings]
+        shown = [interval(line.cells[s].absolute) if s in line.cells else NOTHING for s in settings]
+        rows += [[f"{line.row.label}: paper", *paper, ""], [f"{line.row.label}: here", *shown, _VERDICTS[line.agrees]]]
+    return Table(["", *settings, "paper's order"], rows, tuple(range(2, len(rows), 2)))
+
+
 def headline_table(results: Results, lines: Sequence[HeadlineLine]) -> Table:
     """The paper's rows: printed values, then ours in both readings, relative to the baseline."""
     settings = [setting.name for setting in results.suite.grids[0].settings]
@@ -47,8 +68,7 @@ def headline_table(results: Results, lines: Sequence[HeadlineLine]) -> Table:
             paper = [number(line.row.paper[s], 4) if s in line.row.paper else NOTHING for s in settings]
             rows.append([f"{line.row.label}: paper", *paper, ""])
         shown = [interval(line.cells[s].relative) if s in line.cells else NOTHING for s in settings]
-        verdict = {True: "yes", False: "no", None: NOTHING}[line.agrees]
-        rows.append([f"{line.row.label}: {READINGS[line.reading]}", *shown, verdict])
+        rows.append([f"{line.row.label}: {READINGS[line.reading]}", *shown, _VERDICTS[line.agrees]])
     return Table(["relative to " + results.suite.grids[0].baseline, *settings, "paper's order"], rows, tuple(rules[1:]))
 
 

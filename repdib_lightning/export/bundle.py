@@ -16,13 +16,14 @@ from torch import Tensor, nn
 
 from repdib_lightning.bottlenecks.base import Bottleneck
 from repdib_lightning.bottlenecks.vector_quantiser import VectorQuantiser
+from repdib_lightning.classifiers import Classifier
 from repdib_lightning.data.files import sync_directory, sync_file
 from repdib_lightning.decoders import Decoder
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError
-from repdib_lightning.export.description import CONFIG, DECODER_WEIGHTS, WEIGHTS, as_text, bundle_config, sealed
+from repdib_lightning.export.description import CONFIG, HEADS, WEIGHTS, as_text, bundle_config, sealed
 from repdib_lightning.export.formats import check_formats, write_format
-from repdib_lightning.export.load import load_decoder, load_encoder
+from repdib_lightning.export.load import load_classifier, load_decoder, load_encoder
 from repdib_lightning.word_lists import words
 
 
@@ -34,6 +35,7 @@ def save_bundle(
     training: Mapping[str, Any],
     data: Mapping[str, Any],
     decoder: Decoder | None = None,
+    classifier: Classifier | None = None,
     overwrite: bool = False,
     formats: str | Sequence[str] = "safetensors",
 ) -> Path:
@@ -44,8 +46,9 @@ def save_bundle(
         encoder: trained; its class must be in ``encoders.ENCODERS``.
         bottleneck: trained; its class must be in ``bottlenecks.BOTTLENECKS``.
         training: plain facts of the run (objective, steps, run).
-        data: plain facts of the data (file, fingerprint); folders of absolute paths are left out.
+        data: plain facts of the data (file, fingerprint, held_out); folders of absolute paths are left out.
         decoder: trained, of the latents of both; its class must be in ``decoders.DECODERS``.
+        classifier: the same; its class must be in ``classifiers.CLASSIFIERS``.
         overwrite: replace an existing bundle (never a folder that holds anything else).
         formats: ``safetensors`` (always written), ``pt2`` (torch.export), ``onnx``; several between commas.
 
@@ -61,20 +64,25 @@ def save_bundle(
     chosen = words(formats, "formats")
     check_formats(chosen)
     modules: dict[str, nn.Module] = {"encoder": encoder, "bottleneck": bottleneck}
-    _check_trained([*modules.values(), *([] if decoder is None else [decoder])])
-    config = bundle_config(encoder, bottleneck, training, data, decoder)
+    heads: dict[str, nn.Module] = {}
+    if decoder is not None:
+        heads["decoder"] = decoder
+    if classifier is not None:
+        heads["classifier"] = classifier
+    encoder.require_ready()
+    _check_trained([*modules.values(), *heads.values()])
+    config = bundle_config(encoder, bottleneck, training, data, heads)
     content = tensors_to_bytes(_weights(nn.ModuleDict(modules)))
     with _whole_folder(target) as aside:
-        drawing = []
-        if decoder is not None:
-            (aside / DECODER_WEIGHTS).write_bytes(tensors_to_bytes(_weights(decoder)))
-            drawing = [DECODER_WEIGHTS]
-        _write(aside, content, config, drawing)
+        for key, head in heads.items():
+            (aside / HEADS[key].weights).write_bytes(tensors_to_bytes(_weights(head)))
+        beside = [HEADS[key].weights for key in heads]
+        _write(aside, content, config, beside)
         frozen = load_encoder(aside)
-        if decoder is not None:
-            load_decoder(aside)
+        for key in heads:
+            {"decoder": load_decoder, "classifier": load_classifier}[key](aside)
         written = [name for form in chosen for name in write_format(form, frozen, aside)]
-        _write(aside, content, config, [*drawing, *written])
+        _write(aside, content, config, [*beside, *written])
     return target
 
 

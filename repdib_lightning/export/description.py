@@ -5,11 +5,12 @@
     format, schema_version       repdib_bundle, 1
     encoder, bottleneck          {class: a name of the allow-list, arguments: plain values}
     decoder                      the same, where the objective drew pictures (absent otherwise)
-    spec                         observations (name -> shape, dtype), actions, frame_stack, horizon
+    classifier                   the same, where the objective recognised a factor (absent otherwise)
+    spec                         observations (name -> shape, dtype), actions, frame_stack, horizon, target, classes
     preprocessing                what the caller does to its observations: nothing but stack frames
     features, groups, codes      M, G, L (G = L = 0 where nothing is quantised)
     versions                     of this package and torch, at export
-    training, data               facts of the run; the data file's name and fingerprint
+    training, data               facts of the run; the data file's name and fingerprint, what was held out of it
     files                        file name -> SHA-256 of its bytes (absent in a run's own description)
     digest                       SHA-256 of all of the above
 """
@@ -19,6 +20,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +28,45 @@ import torch
 from torch import nn
 
 import repdib_lightning
-from repdib_lightning import bottlenecks, decoders, encoders
+from repdib_lightning import bottlenecks, classifiers, decoders, encoders
 from repdib_lightning.bottlenecks import Bottleneck, PerPosition
-from repdib_lightning.decoders import Decoder
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError
 
 FORMAT = "repdib_bundle"
 SCHEMA_VERSION = 1
-CONFIG, WEIGHTS, DECODER_WEIGHTS = "config.json", "model.safetensors", "model.decoder.safetensors"
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+
+
+@dataclass(frozen=True)
+class Head:
+    """A module of the objective that a bundle may hold beside the encoder.
+
+    Attributes:
+        classes: that it may be of, by name.
+        registry: name of that list, for messages.
+        weights: its file.
+        made_by: which objectives have one, for messages.
+    """
+
+    classes: Mapping[str, type[nn.Module]]
+    registry: str
+    weights: str
+    made_by: str
+
+
+HEADS = {
+    "decoder": Head(
+        decoders.DECODERS, "DECODERS", "model.decoder.safetensors", "an objective that draws pictures (Reconstruction)"
+    ),
+    "classifier": Head(
+        classifiers.CLASSIFIERS,
+        "CLASSIFIERS",
+        "model.classifier.safetensors",
+        "an objective that recognises a factor (Classification)",
+    ),
+}
+"""Key of a description -> what stands there."""
 
 MODEL_DESCRIPTION = "bundle.json"
 """The file of a run folder that says how to rebuild its encoder and bottleneck."""
@@ -53,16 +85,16 @@ def bundle_config(
     bottleneck: Bottleneck,
     training: Mapping[str, Any],
     data: Mapping[str, Any],
-    decoder: Decoder | None = None,
+    heads: Mapping[str, nn.Module] | None = None,
 ) -> dict[str, Any]:
-    """Describe the two modules so that they can be rebuilt.
+    """Describe the modules so that they can be rebuilt.
 
     Args:
         encoder: an instance of a class in ``encoders.ENCODERS``.
         bottleneck: an instance of a class in ``bottlenecks.BOTTLENECKS``.
         training: plain facts of the run, e.g. objective, steps, run.
         data: plain facts of the data, e.g. file, fingerprint. Folders of absolute paths are left out.
-        decoder: an instance of a class in ``decoders.DECODERS``, or None.
+        heads: key of :data:`HEADS` -> the module.
 
     Returns:
         Everything of the module docstring but ``files`` and ``digest``.
@@ -72,13 +104,13 @@ def bundle_config(
     """
     # One bottleneck serves all positions of a grid, of which the encoder tells.
     inner = bottleneck.inner if isinstance(bottleneck, PerPosition) else bottleneck
-    drawing = {} if decoder is None else {"decoder": _described(decoder, decoders.DECODERS, "DECODERS")}
+    more = {key: _described(head, HEADS[key].classes, HEADS[key].registry) for key, head in (heads or {}).items()}
     return {
         "format": FORMAT,
         "schema_version": SCHEMA_VERSION,
         "encoder": _described(encoder, encoders.ENCODERS, "ENCODERS"),
         "bottleneck": _described(inner, bottlenecks.BOTTLENECKS, "BOTTLENECKS"),
-        **drawing,
+        **more,
         "spec": encoder.spec.to_dict(),
         "preprocessing": PREPROCESSING,
         "features": encoder.features,

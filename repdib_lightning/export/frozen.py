@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from repdib_lightning.bottlenecks.base import Bottleneck
-from repdib_lightning.encoders.base import Encoder
+from repdib_lightning.encoders.base import Encoder, EncoderOutput
 from repdib_lightning.errors import UserError
 from repdib_lightning.export.observations import Observations, batched_observations
 from repdib_lightning.records import DataSpec
@@ -63,6 +63,23 @@ class FrozenEncoder(nn.Module):
     def encode(self, observations: Observations) -> Tensor:
         """Encode into (N, M) float32, or (M,) without a batch axis. Raises UserError as the class says."""
         return self._run(observations)[0]
+
+    @torch.no_grad()
+    def detailed(self, observations: Observations) -> EncoderOutput:
+        """The latent as ``features``, with what is inside the encoder: codes and attention of its modalities, metrics.
+
+        Losses are left out. Raises UserError as the class says.
+        """
+        tensors, is_batched = batched_observations(observations, self.spec, self.device)
+        if is_batched and not all(map(len, tensors.values())):
+            return EncoderOutput(torch.empty(0, self.features, device=self.device))
+        with torch.autocast(self.device.type, enabled=False):
+            seen = self.encoder.detailed(tensors)
+            latent: Tensor = self.bottleneck(seen.features).latent
+        inside = [seen.codes, seen.attention]
+        if not is_batched:
+            latent, inside = latent[0], [{name: part[0] for name, part in parts.items()} for parts in inside]
+        return EncoderOutput(latent, metrics=seen.metrics, codes=inside[0], attention=inside[1])
 
     def codes(self, observations: Observations) -> Tensor:
         """Encode into (N, G) int64 in [0, L), or (G,) without a batch axis.

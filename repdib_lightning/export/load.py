@@ -5,18 +5,19 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as read_tensors
 from torch import nn
 
+from repdib_lightning.classifiers import Classifier
 from repdib_lightning.decoders import Decoder
 from repdib_lightning.errors import UserError
-from repdib_lightning.export.description import CONFIG, DECODER_WEIGHTS, MODEL_DESCRIPTION, WEIGHTS
+from repdib_lightning.export.description import CONFIG, HEADS, MODEL_DESCRIPTION, WEIGHTS
 from repdib_lightning.export.frozen import FrozenEncoder
-from repdib_lightning.export.rebuild import fill, read_description, rebuild, rebuild_decoder
+from repdib_lightning.export.rebuild import fill, read_description, rebuild, rebuild_head
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -47,10 +48,29 @@ def load_decoder(path: str | Path, device: str | torch.device = "cpu") -> Decode
     Raises:
         UserError: as :func:`load_encoder`; or a bundle without a decoder.
     """
-    config = _description_of(Path(path))
-    encoder, _ = rebuild(Path(path) / CONFIG, config)
-    decoder = rebuild_decoder(Path(path) / CONFIG, config, encoder).requires_grad_(False).eval()
-    return _filled(decoder, Path(path), DECODER_WEIGHTS, config, device)
+    return cast(Decoder, _load_head("decoder", Path(path), device))
+
+
+def load_classifier(path: str | Path, device: str | torch.device = "cpu") -> Classifier:
+    """Load the classifier of a bundle whose objective recognised a factor, frozen, in evaluation mode.
+
+    It takes the latents (N, M) that the bundle's encoder gives; ``target`` names the factor, ``classes`` its values.
+
+    Args:
+        path: the bundle's folder.
+        device: where to put it.
+
+    Raises:
+        UserError: as :func:`load_encoder`; or a bundle without a classifier.
+    """
+    return cast(Classifier, _load_head("classifier", Path(path), device))
+
+
+def _load_head(key: str, folder: Path, device: str | torch.device) -> nn.Module:
+    config = _description_of(folder)
+    encoder, _ = rebuild(folder / CONFIG, config)
+    head = rebuild_head(folder / CONFIG, key, config, encoder).requires_grad_(False).eval()
+    return _filled(head, folder, HEADS[key].weights, config, device)
 
 
 def _description_of(folder: Path) -> dict[str, Any]:

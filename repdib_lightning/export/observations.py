@@ -79,7 +79,21 @@ def _length(name: str, tensor: Tensor, spec: ArraySpec) -> int | None:
         return None
     if shape[1:] == spec.shape:
         return shape[0]
-    last = shape[-3:]
-    channels_last = spec.is_image and len(shape) in (3, 4) and (last[2], *last[:2]) == spec.shape
-    hint = "; channels come first" if channels_last else ""
+    hint = _hint(shape, spec)
     raise UserError(f"observation '{name}' has shape {shape}, expected {spec.shape} or (N, *{spec.shape}){hint}")
+
+
+def _hint(shape: tuple[int, ...], spec: ArraySpec) -> str:
+    """What is wrong with a shape that nearly fits."""
+    axes, wanted = len(spec.shape), spec.shape
+    last = shape[-axes:]
+    if len(shape) not in (axes, axes + 1):
+        return ""
+    if (spec.is_image or spec.is_video) and (*last[:-3], last[-1], *last[-3:-1]) == wanted:
+        return "; channels come first"
+    if spec.is_sequence and last[::-1] == wanted:
+        return "; steps come first, then channels"
+    if (spec.is_video or spec.is_sequence) and last[1:] == wanted[1:]:
+        missing = "frames of zeros" if spec.is_video else "NaN"
+        return f"; a clip has {wanted[0]} steps: cut it, or fill it up with {missing}"
+    return ""

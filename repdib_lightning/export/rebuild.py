@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -11,12 +12,11 @@ from typing import Any, NoReturn, TypeVar
 import torch
 from torch import Tensor, nn
 
-from repdib_lightning import bottlenecks, decoders, encoders
+from repdib_lightning import bottlenecks, encoders
 from repdib_lightning.bottlenecks import Bottleneck, for_positions
-from repdib_lightning.decoders import Decoder
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError, nearest
-from repdib_lightning.export.description import FORMAT, PREPROCESSING, SCHEMA_VERSION, digest
+from repdib_lightning.export.description import FORMAT, HEADS, PREPROCESSING, SCHEMA_VERSION, digest
 from repdib_lightning.records import ActionSpec, ArraySpec, DataSpec
 
 _KINDS: dict[str, type] = {
@@ -91,17 +91,23 @@ def rebuild(path: Path, config: Mapping[str, Any]) -> tuple[Encoder, Bottleneck]
     return encoder, bottleneck
 
 
-def rebuild_decoder(path: Path, config: Mapping[str, Any], encoder: Encoder) -> Decoder:
-    """Build the decoder of a description (untrained), leaving torch's random state as it was.
+def rebuild_head(path: Path, key: str, config: Mapping[str, Any], encoder: Encoder) -> nn.Module:
+    """Build a head of a description (untrained), leaving torch's random state as it was.
+
+    Args:
+        path: of the description, for the message.
+        key: of :data:`HEADS`.
+        config: the description.
+        encoder: as :func:`rebuild` gave it.
 
     Raises:
-        UserError: as :func:`rebuild`; or a description without a decoder.
+        UserError: as :func:`rebuild`; or a description without this head.
     """
-    if "decoder" not in config:
-        raise UserError(f"{path}: has no decoder; only an objective that draws pictures (Reconstruction) exports one")
-    _value(path, config, "decoder", dict)
+    if key not in config:
+        raise UserError(f"{path}: has no {key}; only {HEADS[key].made_by} exports one")
+    _value(path, config, key, dict)
     with torch.random.fork_rng(devices=[]):
-        return _build(path, "decoder", config, decoders.DECODERS, encoder.spec, encoder.features)
+        return _build(path, key, config, HEADS[key].classes, encoder.spec, encoder.features)
 
 
 def fill(path: Path, module: nn.Module, tensors: Mapping[str, Tensor], described: str) -> None:
@@ -163,14 +169,17 @@ def _spec(path: Path, plain: Mapping[str, Any]) -> DataSpec:
     observations = {}
     for name, array in _value(path, plain, "observations", dict, "spec.").items():
         key = f"spec.observations.{name}"
-        if not isinstance(array, dict) or set(array) != {"shape", "dtype"}:
-            raise UserError(f"{path}: '{key}' must hold 'shape' and 'dtype'")
+        if not isinstance(array, dict) or not {"shape", "dtype"} <= set(array) <= {"shape", "dtype", "mean", "std"}:
+            raise UserError(f"{path}: '{key}' must hold 'shape' and 'dtype' (and may hold 'mean' and 'std')")
         shape, dtype = array["shape"], array["dtype"]
         if not isinstance(shape, list) or not shape or not all(_is_count(size) for size in shape):
             raise UserError(f"{path}: '{key}.shape' must be a list of sizes, is {shape!r:.60}")
         if dtype not in ("uint8", "float32"):
             raise UserError(f"{path}: '{key}.dtype' must be uint8 or float32, is {dtype!r:.60}")
-        observations[name] = ArraySpec(tuple(shape), dtype)
+        for measured in sorted({"mean", "std"} & set(array)):
+            if not _are_numbers(array[measured], shape[-1]):
+                raise UserError(f"{path}: '{key}.{measured}' must be a list of {shape[-1]} finite numbers")
+        observations[name] = ArraySpec.from_dict(array)
     if not observations:
         raise UserError(f"{path}: 'spec.observations' is empty")
     for count, least in (("frame_stack", 1), ("horizon", 0)):
@@ -186,12 +195,17 @@ def _spec(path: Path, plain: Mapping[str, Any]) -> DataSpec:
     next_frame = plain.get("next_frame", False)  # bundles written before there was one lack it
     if not isinstance(next_frame, bool):
         raise UserError(f"{path}: 'spec.next_frame' must be true or false, is {next_frame!r:.60}")
+    target, classes = plain.get("target", ""), plain.get("classes", [])  # as next_frame
+    if not isinstance(target, str) or not isinstance(classes, list) or not all(isinstance(c, str) for c in classes):
+        raise UserError(f"{path}: 'spec.target' must be text, and 'spec.classes' a list of names")
     return DataSpec(
         observations,
         None if actions is None else ActionSpec(**actions),
         plain["frame_stack"],
         plain["horizon"],
         next_frame,
+        target,
+        tuple(classes),
     )
 
 
@@ -202,6 +216,12 @@ def _value(path: Path, plain: Mapping[str, Any], key: str, kind: type, prefix: s
     if not isinstance(value, kind) or isinstance(value, bool):
         raise UserError(f"{path}: '{prefix}{key}' must be {_NAMES[kind]}, is {value!r:.60}")
     return value
+
+
+def _are_numbers(values: Any, count: int) -> bool:
+    """Whether this is a list of so many finite numbers."""
+    plain = isinstance(values, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
+    return plain and len(values) == count and all(math.isfinite(value) for value in values)
 
 
 def _is_count(value: Any) -> bool:

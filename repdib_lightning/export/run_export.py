@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from repdib_lightning.bottlenecks.base import Bottleneck
+from repdib_lightning.classifiers import Classifier
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.decoders import Decoder
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError
 from repdib_lightning.export.bundle import save_bundle
-from repdib_lightning.export.description import MODEL_DESCRIPTION, as_text, bundle_config, sealed
-from repdib_lightning.export.rebuild import fill, read_description, rebuild, rebuild_decoder
+from repdib_lightning.export.description import HEADS, MODEL_DESCRIPTION, as_text, bundle_config, sealed
+from repdib_lightning.export.rebuild import fill, read_description, rebuild, rebuild_head
 from repdib_lightning.word_lists import words
 
 
@@ -27,7 +28,7 @@ def write_model_description(
     *,
     training: Mapping[str, Any],
     data: Mapping[str, Any],
-    drawing: tuple[str, Decoder] | None = None,
+    heads: Mapping[str, tuple[str, nn.Module]] | None = None,
 ) -> Path:
     """Write ``bundle.json``, once the modules are built, so that any later checkpoint of the run can be exported.
 
@@ -36,8 +37,8 @@ def write_model_description(
         encoder: as built, trained or not.
         bottleneck: as built, trained or not.
         training: plain facts (objective, run); the steps are added at export.
-        data: plain facts (file, fingerprint).
-        drawing: name of the decoder among the modules of the objective, and the decoder; None without one.
+        data: plain facts (file, fingerprint, held_out).
+        heads: ``decoder``, ``classifier`` -> its name among the modules of the objective, and the module.
 
     Returns:
         The file.
@@ -46,9 +47,10 @@ def write_model_description(
         UserError: it cannot be written, or holds what a bundle cannot.
     """
     path = Path(run_folder) / MODEL_DESCRIPTION
-    config = bundle_config(encoder, bottleneck, training, data, None if drawing is None else drawing[1])
-    if drawing is not None:
-        config["decoder"]["module"] = f"objective.{drawing[0]}"
+    heads = heads or {}
+    config = bundle_config(encoder, bottleneck, training, data, {key: head for key, (_, head) in heads.items()})
+    for key, (name, _) in heads.items():
+        config[key]["module"] = f"objective.{name}"
     text = as_text(sealed(config))
     with whole_file(path) as temporary:
         temporary.write_text(text)
@@ -86,11 +88,11 @@ def export_run(
     encoder, bottleneck = rebuild(path, config)
     checkpoint_file = _newest_checkpoint(run)
     checkpoint = torch.load(checkpoint_file, map_location="cpu", weights_only=True)
-    decoder = rebuild_decoder(path, config, encoder) if "decoder" in config else None
+    heads = {key: rebuild_head(path, key, config, encoder).eval() for key in HEADS if key in config}
     modules = nn.ModuleDict({"encoder": encoder, "bottleneck": bottleneck})
     fill(checkpoint_file, modules, _parts(checkpoint, modules), path.name)
-    if decoder is not None:
-        fill(checkpoint_file, decoder, _parts(checkpoint, decoder, f"{config['decoder'].get('module')}."), path.name)
+    for key, head in heads.items():
+        fill(checkpoint_file, head, _parts(checkpoint, head, f"{config[key].get('module')}."), path.name)
     training = {"run": run.resolve().name, **config["training"], "steps": int(checkpoint["global_step"])}
     folder = run / "bundle" if output is None else Path(output)
     return save_bundle(
@@ -99,7 +101,8 @@ def export_run(
         bottleneck.eval(),
         training=training,
         data=config["data"],
-        decoder=None if decoder is None else decoder.eval(),
+        decoder=cast(Decoder | None, heads.get("decoder")),
+        classifier=cast(Classifier | None, heads.get("classifier")),
         overwrite=overwrite,
         formats=words(formats, "formats"),
     )

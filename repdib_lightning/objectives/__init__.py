@@ -1,6 +1,7 @@
-"""Self-supervised objectives."""
+"""Objectives: self-supervised ones, and one that recognises a factor."""
 
 from repdib_lightning.objectives.base import Encode, Objective
+from repdib_lightning.objectives.classification import Classification
 from repdib_lightning.objectives.driml import DRIML
 from repdib_lightning.objectives.dynamic_bottleneck import DynamicBottleneck
 from repdib_lightning.objectives.emi import EMI
@@ -20,6 +21,7 @@ OBJECTIVES: dict[str, type[Objective]] = {
         EMI,
         DynamicBottleneck,
         Reconstruction,
+        Classification,
         SeveralObjectives,
     )
 }
@@ -29,6 +31,7 @@ __all__ = [
     "DRIML",
     "EMI",
     "OBJECTIVES",
+    "Classification",
     "DynamicBottleneck",
     "Encode",
     "ForwardPrediction",

@@ -1,4 +1,4 @@
-"""The contract of a self-supervised objective, and what several of them ask of a batch."""
+"""The contract of an objective, and what several of them ask of a batch."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from collections.abc import Callable
 
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torchmetrics import MetricCollection
 
+from repdib_lightning.classifiers import Classifier
 from repdib_lightning.decoders import Decoder
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import ActionSpec, Batch, DataSpec, ObjectiveOutput
@@ -31,6 +33,18 @@ class Objective(nn.Module):
     def find_decoder(self) -> tuple[str, Decoder] | None:
         """The decoder among its modules, and its name there; exported with the encoder. None if it draws nothing."""
         return next(((name, part) for name, part in self.named_modules() if isinstance(part, Decoder)), None)
+
+    def find_classifier(self) -> tuple[str, Classifier] | None:
+        """The classifier among its modules, and its name there; exported with the encoder. None if it has none."""
+        return next(((name, part) for name, part in self.named_modules() if isinstance(part, Classifier)), None)
+
+    def held_out_metrics(self) -> dict[str, MetricCollection]:
+        """Build the metrics of a whole held-out set that are no mean over its batches.
+
+        :meth:`forward` puts what their ``update`` takes under their names into ``ObjectiveOutput.updates``. They are
+        built anew for every evaluation, and sum up the processes themselves.
+        """
+        return {}
 
     def forward(self, batch: Batch, encode: Encode) -> ObjectiveOutput:
         """Encode what is needed with one call of ``encode``, and return unweighted losses."""

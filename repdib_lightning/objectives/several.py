@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from torch import Tensor, nn
+from torchmetrics import MetricCollection
 
 from repdib_lightning.errors import UserError
 from repdib_lightning.objectives.base import Encode, Objective
@@ -62,6 +63,15 @@ class SeveralObjectives(Objective):
                 _check_free(name, type(part).__name__, owners)
             joined.losses |= output.losses
             joined.metrics |= output.metrics
+            joined.updates |= output.updates
+        return joined
+
+    def held_out_metrics(self) -> dict[str, MetricCollection]:
+        """Those of all parts."""
+        joined: dict[str, MetricCollection] = {}
+        for part in self.parts:
+            assert isinstance(part, Objective)
+            joined |= part.held_out_metrics()
         return joined
 
 

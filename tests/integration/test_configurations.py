@@ -13,14 +13,18 @@ import pytest
 import yaml
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import clip_stores
 from killing import command_in_processes
 
 from repdib_lightning.__main__ import VERBS, main
 from repdib_lightning.configurations import packaged, packaged_suites
+from repdib_lightning.data.frame_features import store_features
 from repdib_lightning.environments.collect_control import collect_control
 from repdib_lightning.environments.collect_emoji_styles import collect_emoji_styles
 from repdib_lightning.environments.collect_maze import collect_maze
 from repdib_lightning.environments.collect_robot_arm import collect_robot_arm
+from repdib_lightning.environments.collect_smartwatch import collect_smartwatch
 from repdib_lightning.experiments.suite_file import read_suite
 
 ROOT = Path(__file__).parents[2]
@@ -64,8 +68,22 @@ def drawings(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="session")
+def clips(tmp_path_factory):
+    """Clips of twenty people in five sessions, the same with features of frames, and recordings of a smartwatch."""
+    folder = tmp_path_factory.mktemp("clips")
+    few = {"activities": 2, "subjects": 20, "frames": 2, "steps": 12}
+    clip_stores.write_clips(folder / "activities.h5", clips=200, sessions=5, **few)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(clip_stores, "VIEWS", ("cam1", "cam3"))
+        clip_stores.write_clips(folder / "frames.h5", clips=40, missing=False, **few)
+    store_features(folder / "frames.h5", folder / "mmact.h5", device="cpu", progress=False)
+    collect_smartwatch(folder / "smartwatch.h5", hop=30.0, progress=False)
+    return folder
+
+
 @pytest.fixture
-def here(tmp_path, monkeypatch, recording, maze_recording, control_recording, drawings):
+def here(tmp_path, monkeypatch, recording, maze_recording, control_recording, drawings, clips):
     monkeypatch.chdir(tmp_path)
     Path("data").mkdir()
     for name in ("walker_walk_video", "walker_walk_demo", "vd4rl_walker_walk_video"):
@@ -73,13 +91,16 @@ def here(tmp_path, monkeypatch, recording, maze_recording, control_recording, dr
     shutil.copy(maze_recording, "data/gridworld.h5")
     for name in ("emoji_styles", "pacs_elephants"):
         shutil.copy(drawings / f"{name}.h5", "data")
+    for name in ("activities", "mmact", "smartwatch"):
+        Path(f"data/{name}.h5").hardlink_to(clips / f"{name}.h5")
     shutil.copy(recording, "data/robot_arm.h5")
     shutil.copy(recording, "data/robot_arm_demo.h5")
     return tmp_path
 
 
 PAPER = "paper/vd4rl/multi_step_inverse"
-BASES = ("robot_arm", "mazes", "control", "factors", PAPER)
+HAMLET, MMACT = "activities/hamlet", "paper/mmact/hamlet"
+BASES = ("robot_arm", "mazes", "control", "factors", HAMLET, f"{HAMLET}_repdib", PAPER, MMACT)
 """Configurations of a whole run; the others are laid over one of them."""
 
 OVERLAYS = [name for name in packaged() if name not in BASES]
@@ -95,6 +116,10 @@ LAYERS = [
     *(["factors", name] for name in [*ANYWHERE_DRAWN, "factors_grid"]),
     ["factors", "paper/pacs"],
     *([PAPER, name] for name in OVERLAYS if name.startswith("paper/vd4rl/")),
+    [HAMLET, "activities/keyless", "activities/repdib_fusion"],
+    [HAMLET, "activities/repdib_both", "activities/weighting", "activities/sessions"],
+    [HAMLET, "activities/smartwatch", "activities/smartwatch_sides", "debug"],
+    [MMACT, f"{MMACT}_repdib"],
 ]
 ON_A_CPU = ["--trainer.accelerator", "cpu", "--trainer.precision", "32-true"]
 
@@ -110,6 +135,15 @@ def test_every_configuration_trains(here, layers):
 
 def test_every_configuration_is_in_a_test():
     assert {name for layers in LAYERS for name in layers} == set(packaged())
+
+
+def test_hamlet_with_repdib_is_hamlet_and_its_overlay(here, capsys):
+    asked = []
+    for layers in ([f"{HAMLET}_repdib"], [HAMLET, "activities/repdib_both"]):
+        with pytest.raises(SystemExit):
+            main(["fit", *(word for name in layers for word in ("--config", name)), "--print_config"])
+        asked.append(capsys.readouterr().out)
+    assert asked[0] == asked[1] and "bottleneck: RepDIB" in asked[0]
 
 
 def test_a_missing_recording_is_collected_first(here, recording, monkeypatch):
@@ -279,6 +313,28 @@ def test_the_suite_of_offline_control(here, capsys):
     written = {path.name for path in Path("results/control").iterdir()}
     figures = {"films.png", "film-headline-repdib-walker_walk.mp4", "drawn.png", "headline-learning-eval-return.png"}
     assert {"report.md", "report.html", "curves.csv", *figures} <= written
+
+
+def test_the_suite_of_activities(here, capsys):
+    """The packaged suite, cut down to one point of few steps."""
+    plan = yaml.safe_load(packaged_suites()["activities"].read_text())
+    steps = {"trainer.max_steps": 3, "trainer.val_check_interval": 2, "data.batch_size": 8}
+    steps |= {"trainer.log_every_n_steps": 1}
+    at_once = {"model.bottleneck.init_args.start_step": 1, "model.encoder.init_args.bottleneck_options.start_step": 1}
+    hamlet = {"config": "activities/repdib_both", **steps, **at_once}
+    plan["grids"] = {"subjects": {"settings": {"hamlet": hamlet}}}
+    row = plan["headline"]["unseen people"]
+    plan["headline"] = {"unseen people": {**row, "paper": {"hamlet": row["paper"]["hamlet"]}}}
+    plan |= {"seeds": [0], "claims": {}, "recognised": ["subjects/hamlet"]}
+    Path("activities.yaml").write_text(yaml.safe_dump(plan))
+    for verb in ("run", "report"):
+        assert main(["suite", verb, "activities.yaml"]) == 0
+        assert "1 finished of 1" in capsys.readouterr().out or verb == "report"
+    written = {path.name for path in Path("results/activities").iterdir()}
+    drawn = {f"recognised-subjects-hamlet-{name}.png" for name in ("confusion", "modalities", "clips")}
+    assert {"report.md", "report.html", "overview-recognition-f1_macro.png", *drawn} <= written
+    text = Path("results/activities/report.md").read_text()
+    assert "| unseen people: here |" in text and "| recognition/perplexity/fused |" in text
 
 
 @pytest.mark.parametrize("name", packaged_suites())

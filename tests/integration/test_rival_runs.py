@@ -76,12 +76,15 @@ INVERSE = {"class_path": "InverseDynamics"}
     ("overlay", "wanted"),
     [
         (parts({"class_path": "InversDynamics"}), "parts: unknown class 'InversDynamics', did you mean 'InverseDynam"),
-        (parts({"class_path": "RepDIB"}), "model.objective.parts: unknown class 'RepDIB', choices: DRIML, Dynamic"),
+        (
+            parts({"class_path": "RepDIB"}),
+            "model.objective.parts: unknown class 'RepDIB', choices: Classification, DRIML",
+        ),
         (parts(INVERSE, {"class_path": "EMI", "init_args": {"dimension": 3}}), "parts.dimension, did you mean 'dimens"),
         (parts({"class_path": "DRIML", "init_args": {"hidden": "x"}}), "parts.hidden: expected int, got 'x'"),
         (parts({"class_path": "DRIML", "hidden": 3}), "parts: options of a class belong under its init_args"),
         (parts({"class_path": "DRIML", "init_arg": {"hidden": 3}}), "parts.init_arg, did you mean 'init_args'?"),
-        (parts(7), "model.objective.parts: expected a class, got '7', choices: DRIML"),
+        (parts(7), "model.objective.parts: expected a class, got '7', choices: Classification, DRIML"),
         (parts(), "SeveralObjectives: parts is empty"),
         (parts(INVERSE, INVERSE), "InverseDynamics and InverseDynamics both give 'inverse'"),
         (parts(INVERSE, {"class_path": "EMI"}), "EMI: needs the frame after the anchor in every sample; set data.next"),

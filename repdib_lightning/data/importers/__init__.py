@@ -10,5 +10,7 @@ IMPORTERS: dict[str, str] = {
     "vd4rl": "repdib_lightning.data.importers.vd4rl:import_vd4rl",
     "images": "repdib_lightning.data.importers.image_folder:import_images",
     "pacs": "repdib_lightning.data.importers.pacs:import_pacs",
+    "mmact": "repdib_lightning.data.importers.mmact:import_mmact",
+    "smartwatch": "repdib_lightning.data.importers.smartwatch:import_smartwatch",
     "store": "repdib_lightning.data.importers.repack:import_store",
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +9,11 @@ import h5py
 import numpy as np
 from tqdm import tqdm
 
+from repdib_lightning.data.copies import kept_attributes
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.sequential import SequentialRows
 from repdib_lightning.data.writer import EpisodeWriter
 from repdib_lightning.errors import UserError
-
-_SET_BY_WRITER = ("format", "schema_version", "fingerprint")
 
 
 def import_store(source: Path, output: Path, *, overwrite: bool = False, progress: bool = True) -> Path:
@@ -47,15 +45,16 @@ def import_store(source: Path, output: Path, *, overwrite: bool = False, progres
             factors=store.factors,
             masks=masks,
             rewards="rewards" in columns,
-            attributes={key: _plain(value) for key, value in store.attributes.items() if key not in _SET_BY_WRITER},
+            attributes=kept_attributes(store),
+            recordings="episodes/recording" in store,
             overwrite=overwrite,
         )
         with writer, tqdm(total=store.rows, desc="import", unit="row", disable=not progress) as bar:
             for episode in range(len(store.lengths)):
                 start, length = int(store.starts[episode]), int(store.lengths[episode])
                 rows = {name: column.read(start, start + length) for name, column in columns.items()}
-                held_out = bool(store.evaluation[episode])
-                writer.add_episode(**_arguments(rows, store.masks), evaluation=held_out)
+                held_out, recording = bool(store.evaluation[episode]), store.recording_of(episode)
+                writer.add_episode(**_arguments(rows, store.masks), evaluation=held_out, recording=recording)
                 bar.update(length)
     return output
 
@@ -94,12 +93,3 @@ def _arguments(rows: dict[str, np.ndarray], mask_widths: dict[str, int]) -> dict
         if name in rows:
             arguments[name] = rows[name][:-1]
     return arguments
-
-
-def _plain(value: Any) -> Any:
-    """Attributes come back as the writer stores them: numbers and text as they are, arrays as JSON lists."""
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, bytes):
-        return value.decode(errors="replace")
-    return value if isinstance(value, (str, int, float, bool)) else json.loads(json.dumps(value, default=str))

@@ -10,19 +10,20 @@ import torch
 from repdib_lightning.__main__ import main
 from repdib_lightning.bottlenecks import Identity, VectorQuantiser
 from repdib_lightning.data.episodes import EpisodeStore
+from repdib_lightning.data.schema import FactorSpec
+from repdib_lightning.data.writer import EpisodeWriter
 from repdib_lightning.encoders import ConvolutionalEncoder
 from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation.encoded_store import encode_store
 from repdib_lightning.evaluation.features import encode_rows
 from repdib_lightning.export import load_encoder, save_bundle
-from repdib_lightning.records import ArraySpec, DataSpec
-
-SPEC = DataSpec({"front": ArraySpec((6, 24, 24))}, None, 2)
+from repdib_lightning.records import ActionSpec, ArraySpec, DataSpec
 
 
-def bundle(folder: Path, quantised: bool) -> Path:
+def bundle(folder: Path, quantised: bool, stack: int = 2) -> Path:
     torch.manual_seed(0)
-    encoder = ConvolutionalEncoder(SPEC, features=8, channels=4, strides=[3, 2])
+    spec = DataSpec({"front": ArraySpec((3 * stack, 24, 24))}, None, stack)
+    encoder = ConvolutionalEncoder(spec, features=8, channels=4, strides=[3, 2])
     bottleneck = Identity(8)
     if quantised:
         bottleneck = VectorQuantiser(8, groups=2, codes=5, start_step=0)
@@ -50,9 +51,6 @@ def test_vectors_are_those_of_the_encoder_and_the_rest_stays(tmp_path, make_stor
 
 
 def test_rewards_and_ends_stay(tmp_path):
-    from repdib_lightning.data.writer import EpisodeWriter
-    from repdib_lightning.records import ActionSpec
-
     random = np.random.default_rng(0)
     writer = EpisodeWriter(tmp_path / "a.h5", rows=12, episodes=2, observations={"front": ArraySpec((3, 24, 24))},
                            actions=ActionSpec("continuous", 2), rewards=True)  # fmt: skip
@@ -66,6 +64,26 @@ def test_rewards_and_ends_stay(tmp_path):
     before, after = EpisodeStore(tmp_path / "a.h5"), EpisodeStore(made)
     for name in ("rewards", "terminations", "truncations"):
         assert np.array_equal(before.array(name), after.array(name)), name
+
+
+def test_recordings_names_and_attributes_stay_and_those_of_lost_observations_go(tmp_path):
+    told = {"rate": {"front": 30}, "channels": {"front": ["r"]}, "source": "people", "seed": 3}
+    told["classes"] = {"who": ["Ann", "Bob"]}
+    writer = EpisodeWriter(tmp_path / "a.h5", rows=8, episodes=8, observations={"front": ArraySpec((3, 24, 24))},
+                           actions=None, factors={"who": FactorSpec("exogenous", "categorical", 2)}, attributes=told,
+                           recordings=True)  # fmt: skip
+    pictures = np.random.default_rng(0).integers(256, size=(8, 1, 3, 24, 24), dtype=np.uint8)
+    with writer:
+        for clip in range(8):
+            writer.add_episode(observations={"front": pictures[clip]}, factors={"who": np.array([clip // 4])},
+                               evaluation=clip > 5, recording=clip // 2)  # fmt: skip
+    made = EpisodeStore(encode_store(bundle(tmp_path, False, 1), tmp_path / "a.h5", tmp_path / "b.h5", progress=False))
+    store = EpisodeStore(tmp_path / "a.h5")
+    assert np.array_equal(made.recordings, store.recordings) and made.recordings.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert made.class_names == store.class_names == {"who": ["Ann", "Bob"]} and made.factors == store.factors
+    assert np.array_equal(made.evaluation, store.evaluation) and store.evaluation.any()
+    assert made.attributes["source"] == "people" and made.attributes["seed"] == 3
+    assert not {"rate", "channels"} & set(made.attributes)
 
 
 def test_bad_input_is_one_line_and_nothing_is_written(tmp_path, make_store, capsys):

@@ -66,6 +66,16 @@ def only_codes(monkeypatch):
     monkeypatch.setattr(group_probe, "measure_disentanglement", lambda codes, *_, **__: codes)
 
 
+def test_clips_of_one_recording_belong_together(tmp_path, monkeypatch):
+    told = {}
+    monkeypatch.setattr(group_probe, "measure_disentanglement", lambda codes, *_, **given: told.update(given))
+    store = write_scenes(tmp_path / "scenes.h5")
+    store.recordings = np.arange(len(store.starts)) // 2
+    measured(store)
+    rows = np.concatenate([rows_of(store, store.episodes(split)) for split in ("train", "evaluation")])
+    assert sorted(told["origins"]) == sorted(store.recordings[store.row_episodes[rows]])
+
+
 @pytest.mark.parametrize(("quantised", "kind"), [(True, "own"), (False, "k-means 15")])
 def test_each_group_holds_its_factor_and_nobody_the_coin(store, quantised, kind):
     report = measured(store, quantised=quantised, groups=None if quantised else 2)

@@ -218,6 +218,15 @@ def test_inner_folds_hold_out_whole_episodes_of_the_store(monkeypatch, scene, st
     np.testing.assert_array_equal(seen[0], some[IN_FIT[some]] // LENGTH)
 
 
+def test_inner_folds_hold_out_whole_recordings(monkeypatch, scene, tmp_path):
+    seen = []
+    monkeypatch.setattr(decoder, "episode_folds", lambda rows: seen.append(rows) or episode_folds(rows))
+    store = scene.write(tmp_path / "cut.h5")
+    store.recordings = np.arange(len(store.starts)) // 4
+    measure_pictures(scene.weights, store, ALL_ROWS, IN_FIT)
+    np.testing.assert_array_equal(seen[0], ALL_ROWS[IN_FIT] // LENGTH // 4)
+
+
 def test_rows_are_those_of_the_store_and_not_places_in_the_features(scene, store):
     """Probing some rows only gives what a store of these rows alone would give."""
     some = ALL_ROWS[ALL_ROWS // LENGTH >= 4]
