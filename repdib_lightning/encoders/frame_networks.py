@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from repdib_lightning.encoders.convolutional import initialise_orthogonally
 from repdib_lightning.encoders.views import centred
 from repdib_lightning.errors import UserError, nearest
 
@@ -47,6 +48,9 @@ def frame_network(name: str, shape: tuple[int, ...], norm: str, weights: str | N
 class SmallFrames(nn.Module):
     """An 8x8 convolution with stride 4, then 3x3 ones with stride 2 until no side is above 4 (64 px: two of them).
 
+    The maps are normalised together (LayerNorm), and biases start at 0: little of a picture changes from frame to
+    frame, and beside the sensors of a clip a network that starts dull is never trained.
+
     Made for clips on a CPU: at 64 px a frame costs 0.9 million multiplications forward.
 
     Args:
@@ -67,8 +71,9 @@ class SmallFrames(nn.Module):
             after = _SMALL_CHANNELS[min(stage, len(_SMALL_CHANNELS) - 1)]
             layers += [nn.Conv2d(last, after, 3, stride=2, padding=1), nn.ReLU()]
             height, width, last, stage = (height + 1) // 2, (width + 1) // 2, after, stage + 1
-        self.layers = nn.Sequential(*layers, nn.Flatten())
         self.width = last * height * width
+        self.layers = nn.Sequential(*layers, nn.Flatten(), nn.LayerNorm(self.width))
+        self.apply(initialise_orthogonally)
 
     def forward(self, frames: Tensor) -> Tensor:
         """(N, C, H, W) uint8 to (N, width)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from repdib_lightning.encoders.clip_steps import finite_only, observed_frames, observed_readings
+from repdib_lightning.encoders.frame_differences import frame_input, input_channels
 from repdib_lightning.encoders.frame_networks import frame_network
 from repdib_lightning.encoders.recurrence import Recurrence
 from repdib_lightning.encoders.segments import segment_frames
@@ -19,6 +20,7 @@ class FrameSequence(nn.Module):
         network: see :func:`~repdib_lightning.encoders.frame_networks.frame_network`, as the next two.
         norm: of a ResNet.
         weights: file that a ResNet starts from.
+        frame_input: see :func:`~repdib_lightning.encoders.frame_differences.frame_input`.
         segments: see :func:`~repdib_lightning.encoders.segments.segment_frames`.
         layers: of the LSTM.
         dropout: of the vectors of the frames, and between the layers.
@@ -32,13 +34,16 @@ class FrameSequence(nn.Module):
         network: str,
         norm: str,
         weights: str | None,
+        frame_input: str,
         segments: int,
         layers: int,
         dropout: float,
     ) -> None:
         super().__init__()
-        self.segments = segments
-        self.network, inputs = frame_network(network, shape[1:], norm, weights)
+        self.segments, self.frame_input = segments, frame_input
+        channels, *size = shape[1:]
+        seen = (input_channels(frame_input, channels), *size)
+        self.network, inputs = frame_network(network, seen, norm, weights)
         self.project = nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Dropout(dropout))
         self.recurrence = Recurrence(width, layers, dropout)
 
@@ -46,7 +51,8 @@ class FrameSequence(nn.Module):
         """(N, T, C, H, W) uint8 to step vectors (N, T', d), and which of them were observed, (N, T') bool."""
         frames = segment_frames(video, self.segments, training=self.training)
         observed = observed_frames(frames)
-        steps = self.project(self.network(frames.flatten(0, 1))).unflatten(0, observed.shape)
+        seen = frame_input(frames, observed, self.frame_input)
+        steps = self.project(self.network(seen.flatten(0, 1))).unflatten(0, observed.shape)
         return self.recurrence(steps, observed), observed
 
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from repdib_lightning.encoders.base import Encoder, EncoderOutput
 from repdib_lightning.encoders.clip_modalities import clip_modalities, sequences_among
+from repdib_lightning.encoders.frame_differences import check_frame_input
 from repdib_lightning.encoders.frame_sequences import FeatureSequence, FrameSequence
 from repdib_lightning.encoders.modality_dropout import drop_modalities
 from repdib_lightning.encoders.modality_fusion import build_fusion
@@ -49,6 +50,8 @@ class MultimodalEncoder(Encoder):
         network: of each frame: ``small``, ``resnet18``, ``resnet34`` or ``resnet50``.
         norm: of the ResNets: ``group``, or ``frozen``, the batch statistics that ``weights`` hold.
         weights: file of torchvision's weights that the ResNets start from. A bundle does not hold its name.
+        frame_input: what the networks see of each frame: ``frames``, their ``differences`` from the mean frame of the
+            clip (before a camera that stands still: what moves), or ``both``.
         segments: frames taken of each video, one of each of so many equal parts; 0 for all.
         frame_features: names of sequences that hold features of frames, computed before.
         window: readings of a window.
@@ -86,6 +89,7 @@ class MultimodalEncoder(Encoder):
         network: Literal["small", "resnet18", "resnet34", "resnet50"] = "small",
         norm: Literal["group", "frozen"] = "group",
         weights: str | None = None,
+        frame_input: Literal["frames", "differences", "both"] = "frames",
         segments: int = 8,
         frame_features: list[str] | None = None,
         window: int = 5,
@@ -102,6 +106,7 @@ class MultimodalEncoder(Encoder):
         super().__init__(seen_only(spec, names), features)
         _at_least(1, width=width, window=window, stride=stride, channels=channels)
         _at_least(0, layers=layers, segments=segments)
+        check_frame_input(frame_input)
         _chances(dropout=dropout, modality_dropout=modality_dropout)
         self.modalities, self.modality_dropout = names, modality_dropout
 
@@ -127,6 +132,7 @@ class MultimodalEncoder(Encoder):
                     network=network,
                     norm=norm,
                     weights=weights,
+                    frame_input=frame_input,
                     segments=segments,
                     layers=layers,
                     dropout=dropout,
