@@ -58,7 +58,8 @@ class MultimodalEncoder(Encoder):
         stride: readings from one window to the next.
         channels: of the convolutions over readings.
         angles: names of sequences in degrees, which enter as sine and cosine.
-        rotation: see :class:`SensorAugmentation`, as the rest: degrees by which worn devices are turned in training.
+        reflection: see :class:`SensorAugmentation`, as the rest: chance that a training clip is mirrored.
+        rotation: degrees by which worn devices are turned in training.
         rotated: names of the sequences that turn; acceleration and gyroscope by default.
         scaling: deviation of a sensor's factor.
         jitter: deviation of the noise, in those of the channel.
@@ -96,6 +97,7 @@ class MultimodalEncoder(Encoder):
         stride: int = 5,
         channels: int = 64,
         angles: list[str] | None = None,
+        reflection: float = 0.0,
         rotation: float = 0.0,
         rotated: list[str] | None = None,
         scaling: float = 0.0,
@@ -117,6 +119,7 @@ class MultimodalEncoder(Encoder):
         self.augmentation = SensorAugmentation(
             readings,
             angles,
+            reflection=reflection,
             rotation=rotation,
             rotated=None if rotated is None else sequences_among(readings, "rotated", rotated),
             scaling=scaling,

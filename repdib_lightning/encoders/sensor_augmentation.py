@@ -13,16 +13,20 @@ from repdib_lightning.processes import own_rows, rows_of_all
 from repdib_lightning.records import DataSpec
 
 _ROTATED = ("acceleration", "gyroscope")
+# In a mirror across the x axis a vector loses the sign of x, and what turns, an axial vector, those of y and z.
+_MIRRORED = {"acceleration": (-1.0, 1.0, 1.0), "gyroscope": (1.0, -1.0, -1.0)}
 
 
 class SensorAugmentation(nn.Module):
-    """Rotates, scales, blurs and warps the readings of a clip, each clip by its own draw; nothing in evaluation.
+    """Mirrors, rotates, scales, blurs and warps the readings of a clip, each clip by its own draw; none in evaluation.
 
     What is missing stays missing.
 
     Args:
         spec: of the sequences to change, and nothing else.
         angles: those among them that hold degrees: they are not scaled.
+        reflection: chance that a clip is seen in a mirror across the x axes of its devices. Of a watch, whose x axis
+            runs along the forearm, it is what the other arm would have measured.
         rotation: degrees; standard deviation of each component of a random rotation vector. Channels 3k to 3k + 2 are
             the axes of device k, and turn alike in every sequence of ``rotated``.
         rotated: names of the sequences that rotate; by default those of acceleration and gyroscope that there are.
@@ -31,7 +35,8 @@ class SensorAugmentation(nn.Module):
         time_warp: standard deviation around 1 of the speed of a clip, of all its sensors alike.
 
     Raises:
-        UserError: a negative deviation, or a sequence to rotate whose channels are no triples.
+        UserError: a negative deviation, a chance outside [0, 1], a sequence to rotate or to mirror whose channels are
+            no triples, or one that has no known mirror image.
     """
 
     def __init__(
@@ -39,6 +44,7 @@ class SensorAugmentation(nn.Module):
         spec: DataSpec,
         angles: list[str],
         *,
+        reflection: float,
         rotation: float,
         rotated: list[str] | None,
         scaling: float,
@@ -54,16 +60,21 @@ class SensorAugmentation(nn.Module):
         }.items():
             if value < 0:
                 raise UserError(f"MultimodalEncoder: {option} must not be negative, is {value}")
+        if not 0 <= reflection <= 1:
+            raise UserError(f"MultimodalEncoder: reflection must be in [0, 1], is {reflection}")
         self.sensors = sensors = list(spec.observations)
+        self.reflection = reflection
         self.rotation, self.scaling, self.jitter, self.time_warp = rotation, scaling, jitter, time_warp
         self.rotated = [name for name in _ROTATED if name in sensors] if rotated is None else rotated
         self.scaled = [name for name in sensors if name not in angles]
         for name in self.rotated if rotation else []:
-            channels = spec.observations[name].shape[-1]
-            if channels % 3:
-                raise UserError(
-                    f"MultimodalEncoder: rotated has '{name}', whose {channels} channels are no triples of axes"
-                )
+            _require_triples("rotated has", name, spec)
+        for name in sensors if reflection else []:
+            if name not in _MIRRORED:
+                known = " and ".join(_MIRRORED)
+                raise UserError(f"MultimodalEncoder: reflection knows the mirror images of {known}, not of '{name}'")
+            _require_triples("reflection of", name, spec)
+            self.register_buffer(f"mirror_{name}", torch.tensor(_MIRRORED[name]), persistent=False)
         for name in sensors:
             self.register_buffer(f"std_{name}", channel_statistics(spec.observations[name])[1], persistent=False)
 
@@ -73,6 +84,11 @@ class SensorAugmentation(nn.Module):
             return observations
         changed = dict(observations)
         count, device = changed[self.sensors[0]].shape[0], changed[self.sensors[0]].device
+        if self.reflection:
+            mirrored = _uniform(count, 1, 1, 1, device=device) < self.reflection
+            for name in self.sensors:
+                signs = torch.where(mirrored, self.get_buffer(f"mirror_{name}"), 1.0)
+                changed[name] = (changed[name].unflatten(-1, (-1, 3)) * signs).flatten(2)
         if self.rotation and self.rotated:
             triples = max(changed[name].shape[-1] for name in self.rotated) // 3
             turns = rotation_matrices(_normal(count, triples, 3, device=device) * math.radians(self.rotation))
@@ -114,6 +130,16 @@ def at_speed(readings: Tensor, speed: Tensor) -> Tensor:
     places = (torch.arange(recorded, device=readings.device) * speed).round().long()
     taken = readings.gather(1, places.clamp(max=recorded - 1).unsqueeze(-1).expand_as(readings))
     return taken.masked_fill((places >= recorded).unsqueeze(-1), torch.nan)
+
+
+def _require_triples(complaint: str, name: str, spec: DataSpec) -> None:
+    channels = spec.observations[name].shape[-1]
+    if channels % 3:
+        raise UserError(f"MultimodalEncoder: {complaint} '{name}', whose {channels} channels are no triples of axes")
+
+
+def _uniform(count: int, *shape: int, device: torch.device) -> Tensor:
+    return own_rows(torch.rand(rows_of_all(count), *shape, device=device))
 
 
 def _normal(count: int, *shape: int, device: torch.device) -> Tensor:

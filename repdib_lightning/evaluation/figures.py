@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.evaluation.tables import KINDS
@@ -24,10 +25,11 @@ SHOULD = {"endogenous": "State kept (high is good)", "exogenous": "Noise kept (l
 
 
 def png(figure: Figure) -> bytes:
-    """Draw a figure; the same figure gives the same bytes."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return buffer.getvalue()
+    """Draw a figure, small and opaque; the same figure gives the same bytes."""
+    drawn, opaque = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=110)
+    Image.open(drawn).convert("RGB").save(opaque, "PNG", optimize=True)
+    return opaque.getvalue()
 
 
 def panel_grid(count: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:

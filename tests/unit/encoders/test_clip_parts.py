@@ -20,7 +20,7 @@ from repdib_lightning.records import ArraySpec, DataSpec
 
 SENSORS = ["acceleration", "gyroscope", "orientation"]
 OF_SENSORS = DataSpec({name: SPEC.observations[name] for name in SENSORS})
-OFF = {"rotation": 0.0, "rotated": None, "scaling": 0.0, "jitter": 0.0, "time_warp": 0.0}
+OFF = {"reflection": 0.0, "rotation": 0.0, "rotated": None, "scaling": 0.0, "jitter": 0.0, "time_warp": 0.0}
 
 
 def numbered(count, stored):
@@ -181,6 +181,43 @@ def test_rotations_are_rotations_of_the_asked_size():
     torch.testing.assert_close(turns[2] @ vectors[2], vectors[2])
 
 
+WATCH = DataSpec({name: ArraySpec((12, 3), "float32") for name in ("acceleration", "gyroscope")})
+
+
+def test_reflection_is_what_a_mirrored_movement_measures():
+    torch.manual_seed(0)
+    mirror = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
+    poses = rotation_matrices(torch.randn(12, 3, dtype=torch.float64).cumsum(0) * 0.2)  # of the device in the world
+    forces = torch.randn(12, 3, 1, dtype=torch.float64)
+
+    def measured(poses, forces):
+        turns = poses[:-1].mT @ poses[1:]
+        turning = torch.stack([turns[:, 2, 1] - turns[:, 1, 2], turns[:, 0, 2] - turns[:, 2, 0],
+                               turns[:, 1, 0] - turns[:, 0, 1]], dim=-1)  # fmt: skip
+        turning = torch.cat([turning, turning[-1:]])
+        return {"acceleration": (poses.mT @ forces).mT, "gyroscope": turning[None]}
+
+    clip = {name: readings.reshape(1, 12, 3) for name, readings in measured(poses, forces).items()}
+    expected = measured(mirror @ poses @ mirror, mirror @ forces)
+    seen = SensorAugmentation(WATCH, [], **{**OFF, "reflection": 1.0})(clip)
+    for name, readings in expected.items():
+        torch.testing.assert_close(seen[name], readings.reshape(1, 12, 3))
+
+
+def test_reflection_takes_whole_clips_by_chance_and_keeps_what_is_missing():
+    torch.manual_seed(0)
+    batch = {name: torch.randn(400, 12, 3) + 3 for name in WATCH.observations}
+    batch["acceleration"][5, 2:4] = torch.nan
+    seen = SensorAugmentation(WATCH, [], **{**OFF, "reflection": 0.25})(batch)
+    turned = {name: (seen[name] != batch[name]) & batch[name].isfinite() for name in batch}
+    mirrored = turned["gyroscope"][:, 0, 1]
+    assert 0.18 < mirrored.float().mean() < 0.32
+    assert torch.equal(turned["gyroscope"][:, :, 1], mirrored[:, None].expand(-1, 12))
+    assert torch.equal(turned["acceleration"][:, 0, 0], mirrored), "both sensors of a clip alike"
+    assert torch.equal(seen["acceleration"].isnan(), batch["acceleration"].isnan())
+    assert not turned["acceleration"][..., 1:].any() and not turned["gyroscope"][..., 0].any()
+
+
 def test_scaling_is_one_factor_for_each_clip_and_sensor_and_leaves_angles():
     torch.manual_seed(0)
     batch = clips(200)
@@ -229,6 +266,8 @@ def test_rotation_needs_triples_of_axes():
     spec = DataSpec({"acceleration": ArraySpec((20, 4), "float32")})
     with pytest.raises(UserError, match="'acceleration', whose 4 channels are no triples"):
         SensorAugmentation(spec, [], **{**OFF, "rotation": 5.0})
+    with pytest.raises(UserError, match="reflection of 'acceleration', whose 4 channels are no triples"):
+        SensorAugmentation(spec, [], **{**OFF, "reflection": 0.5})
 
 
 def test_modality_dropout_never_drops_the_last_nor_brings_one_back():

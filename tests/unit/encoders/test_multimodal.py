@@ -267,6 +267,8 @@ def test_it_can_be_traced_with_a_free_batch():
         ({"features": 0}, "features must be at least 1"),
         ({"dropout": 1.0}, r"dropout must be in \[0, 1\), is 1.0"),
         ({"modality_dropout": -0.1}, r"modality_dropout must be in"),
+        ({"reflection": 1.5}, r"reflection must be in \[0, 1\], is 1.5"),
+        ({"reflection": 0.5}, "mirror images of acceleration and gyroscope, not of 'orientation'"),
         ({"scaling": -1.0}, "scaling must not be negative"),
         ({"bottleneck": "RepDBI"}, r"unknown bottleneck 'RepDBI', did you mean 'RepDIB'"),
         ({"bottleneck": "RepDIB", "bottleneck_options": {"code": 3}}, r"has 'code', unknown to RepDIB, did you mean"),
