@@ -40,7 +40,7 @@ class MultimodalEncoder(Encoder):
         width: d, of the vector of each modality, and of its LSTM.
         layers: of each LSTM; 0 for none.
         dropout: of what enters the LSTMs, between their layers, and of the fused vector.
-        pooling: over time, ``attention`` or ``keyless``.
+        pooling: over time, ``attention``, ``keyless`` or ``statistics``.
         fusion: over modalities, ``attention``, ``keyless`` or ``weighting``.
         join: what fusion does with the weighted vectors, ``sum`` or ``concat``.
         heads: of attention, over time and over modalities.
@@ -54,6 +54,7 @@ class MultimodalEncoder(Encoder):
             clip (before a camera that stands still: what moves), or ``both``.
         segments: frames taken of each video, one of each of so many equal parts; 0 for all.
         frame_features: names of sequences that hold features of frames, computed before.
+        sensor_network: of each window of readings: ``convolution``, or hand-made ``statistics``.
         window: readings of a window.
         stride: readings from one window to the next.
         channels: of the convolutions over readings.
@@ -80,7 +81,7 @@ class MultimodalEncoder(Encoder):
         width: int = 128,
         layers: int = 1,
         dropout: float = 0.2,
-        pooling: Literal["attention", "keyless"] = "attention",
+        pooling: Literal["attention", "keyless", "statistics"] = "attention",
         fusion: Literal["attention", "keyless", "weighting"] = "attention",
         join: Literal["sum", "concat"] = "sum",
         heads: int = 2,
@@ -93,6 +94,7 @@ class MultimodalEncoder(Encoder):
         frame_input: Literal["frames", "differences", "both"] = "frames",
         segments: int = 8,
         frame_features: list[str] | None = None,
+        sensor_network: Literal["convolution", "statistics"] = "convolution",
         window: int = 5,
         stride: int = 5,
         channels: int = 64,
@@ -147,6 +149,7 @@ class MultimodalEncoder(Encoder):
                     name,
                     array,
                     width,
+                    network=sensor_network,
                     window=window,
                     stride=stride,
                     channels=channels,

@@ -9,20 +9,27 @@ from torch import Tensor, nn
 
 from repdib_lightning.encoders.clip_steps import finite_only, observed_readings
 from repdib_lightning.encoders.recurrence import Recurrence
-from repdib_lightning.errors import UserError
+from repdib_lightning.encoders.running_standardisation import RunningStandardisation
+from repdib_lightning.encoders.window_statistics import STATISTICS, window_statistics
+from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.records import ArraySpec
+
+NETWORKS = ("convolution", "statistics")
 
 
 class SensorSequence(nn.Module):
     """Windows of readings through two 1-D convolutions, a maximum over time and a linear layer to d, then an LSTM.
 
     HAMLET's encoder of sensors (section III-A), with zeros for what is missing after the normalisation: the mean. A
-    window is a step of the clip if at least half of its readings were observed.
+    window is a step of the clip if at least half of its readings were observed. Instead of the convolutions'
+    maximum it can look at standardised statistics of each window (:func:`window_statistics`): data of few people
+    suffice for these.
 
     Args:
         name: of the sensor, for messages.
         array: (T, X) with the statistics of its channels.
         width: d.
+        network: of a window, ``convolution`` or ``statistics``.
         window: readings of a window.
         stride: readings from one window to the next.
         channels: of the convolutions.
@@ -31,7 +38,7 @@ class SensorSequence(nn.Module):
         angles: the readings are degrees, and enter as sine and cosine.
 
     Raises:
-        UserError: a window that is longer than the clip.
+        UserError: a window that is longer than the clip, or an unknown network.
     """
 
     mean: Tensor
@@ -43,6 +50,7 @@ class SensorSequence(nn.Module):
         array: ArraySpec,
         width: int,
         *,
+        network: str,
         window: int,
         stride: int,
         channels: int,
@@ -54,16 +62,19 @@ class SensorSequence(nn.Module):
         readings, inputs = array.shape
         if window > readings:
             raise UserError(f"MultimodalEncoder: window {window} is longer than the {readings} readings of '{name}'")
+        if network not in NETWORKS:
+            raise UserError(f"MultimodalEncoder: unknown sensor_network '{network}', {nearest(network, NETWORKS)}")
         self.window, self.stride, self.angles = window, stride, angles
         mean, std = channel_statistics(array)
         self.register_buffer("mean", mean, persistent=False)
         self.register_buffer("std", std, persistent=False)
-        self.convolutions = nn.Sequential(
-            nn.Conv1d(2 * inputs if angles else inputs, channels, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv1d(channels, channels, 3, padding=1),
-            nn.ReLU(),
-        )
+        inputs = 2 * inputs if angles else inputs
+        if network == "convolution":
+            self.convolutions = _convolutions(inputs, channels)
+        else:
+            channels = STATISTICS * inputs
+            self.standardise = RunningStandardisation(channels)
+        self.network = network
         self.project = nn.Sequential(nn.Linear(channels, width), nn.ReLU(), nn.Dropout(dropout))
         self.recurrence = Recurrence(width, layers, dropout)
 
@@ -72,16 +83,27 @@ class SensorSequence(nn.Module):
         share = observed_readings(readings).to(self.mean.dtype).unfold(1, self.window, self.stride).mean(-1)
         observed = share >= 0.5
         windows = self._normalised(readings).unfold(1, self.window, self.stride)  # (N, T', X, window)
-        maps = self.convolutions(windows.flatten(0, 1))
-        steps = self.project(maps.amax(-1)).unflatten(0, observed.shape)
+        looked_at = self._look(windows.flatten(0, 1), observed.flatten())
+        steps = self.project(looked_at).unflatten(0, observed.shape)
         return self.recurrence(steps, observed), observed
+
+    def _look(self, windows: Tensor, observed: Tensor) -> Tensor:
+        """(n, X, window) and which were observed, (n,) bool, to (n, channels) or (n, 8 X)."""
+        if self.network == "convolution":
+            return self.convolutions(finite_only(windows)).amax(-1)
+        return self.standardise(window_statistics(windows), observed)
 
     def _normalised(self, readings: Tensor) -> Tensor:
         wide = readings.to(self.mean.dtype)
         if not self.angles:
-            return finite_only((wide - self.mean) / self.std)
+            return (wide - self.mean) / self.std
         radians = wide * (math.pi / 180)
-        return finite_only(torch.cat([radians.sin(), radians.cos()], dim=-1))
+        return torch.cat([radians.sin(), radians.cos()], dim=-1)
+
+
+def _convolutions(inputs: int, channels: int) -> nn.Sequential:
+    first = nn.Conv1d(inputs, channels, 3, padding=1)
+    return nn.Sequential(first, nn.ReLU(), nn.Conv1d(channels, channels, 3, padding=1), nn.ReLU())
 
 
 def channel_statistics(array: ArraySpec) -> tuple[Tensor, Tensor]:

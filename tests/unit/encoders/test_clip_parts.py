@@ -59,8 +59,8 @@ def test_which_steps_were_observed():
 
 def test_a_window_counts_if_half_of_it_was_observed():
     torch.manual_seed(0)
-    sensor = SensorSequence("x", ArraySpec((12, 2), "float32"), 4, window=4, stride=4, channels=5, layers=1,
-                            dropout=0.0, angles=False)  # fmt: skip
+    sensor = SensorSequence("x", ArraySpec((12, 2), "float32"), 4, network="convolution",
+                            window=4, stride=4, channels=5, layers=1, dropout=0.0, angles=False)  # fmt: skip
     readings = torch.randn(1, 12, 2)
     readings[0, 1:4], readings[0, 6:8] = torch.nan, torch.nan
     steps, observed = sensor(readings)
@@ -72,7 +72,9 @@ def test_a_window_counts_if_half_of_it_was_observed():
 
 def test_overlapping_windows_and_constant_channels():
     array = ArraySpec((12, 2), "float32", (3.0, 5.0), (2.0, 0.0))
-    sensor = SensorSequence("x", array, 4, window=4, stride=2, channels=5, layers=0, dropout=0.0, angles=False)
+    sensor = SensorSequence(
+        "x", array, 4, network="convolution", window=4, stride=2, channels=5, layers=0, dropout=0.0, angles=False
+    )
     readings = torch.full((1, 12, 2), 5.0)
     assert sensor(readings)[0].shape == (1, 5, 4) and sensor(readings)[0].isfinite().all()
     assert channel_statistics(array)[1].tolist() == [2.0, 1.0]

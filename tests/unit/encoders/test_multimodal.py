@@ -26,6 +26,7 @@ KINDS = {
     "hamlet": {},
     "hamlet concat": {"join": "concat", "layers": 2},
     "keyless": {"pooling": "keyless", "fusion": "keyless", "layers": 0},
+    "statistics": {"sensor_network": "statistics", "layers": 0},
     "weighting": {"pooling": "keyless", "fusion": "weighting", "join": "concat"},
     "both levels": {"fusion": "weighting", **REPDIB},
     "gradient codes": {
@@ -258,6 +259,7 @@ def test_it_can_be_traced_with_a_free_batch():
         ({"fusion": "keylss"}, r"unknown fusion 'keylss', did you mean 'keyless'"),
         ({"join": "cat"}, r"unknown join 'cat', did you mean 'concat'"),
         ({"heads": 3}, "heads 3 must divide the width 8"),
+        ({"sensor_network": "statistic"}, r"unknown sensor_network 'statistic', did you mean 'statistics'"),
         ({"network": "resnet19"}, r"unknown network 'resnet19', did you mean 'resnet18'"),
         ({"norm": "gruop"}, r"unknown norm 'gruop', did you mean 'group'"),
         ({"weights": "w.pth"}, "weights are of a ResNet"),

@@ -1,0 +1,22 @@
+"""Hand-made features of windows of readings."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+STATISTICS = 8
+"""Numbers for each channel."""
+
+
+def window_statistics(windows: Tensor) -> Tensor:
+    """(..., X, T) to (..., 8 X): mean, deviation, least, quartiles, most and mean size of a step of each channel.
+
+    Of what is finite; zeros where nothing is. A step is the difference of two readings that follow each other.
+    """
+    shares = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0], dtype=windows.dtype, device=windows.device)
+    order = windows.nanquantile(shares, dim=-1).unbind(0)
+    mean = windows.nanmean(-1)
+    deviation = (windows - mean.unsqueeze(-1)).square().nanmean(-1).sqrt()
+    steps = windows.diff(dim=-1).abs().nanmean(-1)
+    return torch.stack([mean, deviation, *order, steps], dim=-1).nan_to_num(0.0, 0.0, 0.0).flatten(-2)
