@@ -8,7 +8,6 @@ import numpy as np
 
 from repdib_lightning.data.clips import holds_clips, is_clip, lacks_channels, observed_steps
 from repdib_lightning.data.episodes import EpisodeStore
-from repdib_lightning.data.frame_captions import class_names
 from repdib_lightning.data.inspection_text import short_number, spread
 
 _WIDTH, _MOST_CLASSES = 116, 60
@@ -43,7 +42,7 @@ def _stream(store: EpisodeStore, name: str) -> str:
 
 def _class_counts(store: EpisodeStore) -> list[str]:
     """Each categorical factor with the number of clips of every class."""
-    names = class_names(store)
+    names = store.class_names
     held_out = np.isin(store.row_episodes, store.episodes("evaluation"))
     lines = ["", "clips of each class (of them for evaluation):"]
     for factor, spec in sorted(store.factors.items()):

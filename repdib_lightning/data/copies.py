@@ -55,7 +55,7 @@ def kept_of_episode(store: EpisodeStore, episode: int) -> dict[str, Any]:
     """All but the observations and masks of an episode, as the writer takes it."""
     rows = episode_rows(store, episode)
     kept: dict[str, Any] = {
-        "evaluation": bool(store.evaluation[episode]),
+        "evaluation": bool(store.held_out_episodes[episode]),
         "recording": store.recording_of(episode),
         "factors": {name: store.gather(f"factors/{name}", rows) for name in store.factors},
     }

@@ -153,13 +153,18 @@ class EpisodeStore:
         """Names of all values of a categorical factor: as the file states them, or their numbers."""
         return self.class_names.get(factor) or [str(number) for number in range(self.factors[factor].classes)]
 
+    @property
+    def held_out_episodes(self) -> np.ndarray:
+        """(E,) bool: those that are held out by factors, else those that the file marks, which may be none."""
+        return self.evaluation if self._chosen is None else self._chosen
+
     def episodes(self, split: Split) -> np.ndarray:
         """Indices of the episodes of a split.
 
         For evaluation are those that are held out by factors, else those that are stored as such, else (nothing is
         stored) those of every fifth recording.
         """
-        held_out = self.evaluation if self._chosen is None else self._chosen
+        held_out = self.held_out_episodes
         if not held_out.any():
             held_out = np.unique(self.recordings, return_inverse=True)[1] % 5 == 4
         return np.flatnonzero(held_out if split == "evaluation" else ~held_out)

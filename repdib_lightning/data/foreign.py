@@ -12,6 +12,8 @@ from repdib_lightning.data.schema import FORMAT
 _IMPORT = "python -m repdib_lightning import"
 _PICTURES = (".jpg", ".jpeg", ".png")
 _VISIBLE = "[!._]*"
+_STREAMS = ("acc_watch_clip", "acc_phone_clip", "gyro_clip", "orientation_clip")
+_WATCH = "watch_dataset.npy"
 
 
 def describe_foreign(path: Path) -> str | None:
@@ -22,12 +24,16 @@ def describe_foreign(path: Path) -> str | None:
         return _describe_npz(path)
     if path.suffix.lower() == ".csv" and path.is_file():
         return f"{path}: a table; if it lists image files, convert it: {_IMPORT} images {path} data/NAME.h5"
+    if path.name == _WATCH and path.is_file():
+        return f"{path}: seglearn's recordings of a smartwatch; convert: {_IMPORT} smartwatch {path} data/NAME.h5"
     if path.is_file() and h5py.is_hdf5(path):
         return _describe_hdf5(path)
     return None
 
 
 def _describe_folder(folder: Path) -> str | None:
+    if streams := [name for name in _STREAMS if (folder / name).is_dir()]:
+        return f"{folder}: sensors of MMAct's form ({streams[0]}/); convert: {_IMPORT} mmact {folder} data/NAME.h5"
     for ending, form in (("npz", "64 px episodes"), ("hdf5", "84 px shards")):
         files = sorted(folder.glob(f"*.{ending}"))
         if files and describe_foreign(files[0]) is not None:

@@ -7,22 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from repdib_lightning.data.class_names import stated_names
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.inspection_text import short_number
 
 _MOST_FACTORS = 8
-
-
-def class_names(store: EpisodeStore) -> dict[str, list[str]]:
-    """Categorical factor, or ``actions`` -> names of its classes, where the attribute ``classes`` has one for each.
-
-    What another program wrote there is passed over: numbers are shown then.
-    """
-    counts = {name: spec.classes for name, spec in store.factors.items() if spec.scale == "categorical"}
-    if store.actions_spec is not None and store.actions_spec.kind == "discrete":
-        counts["actions"] = store.actions_spec.size
-    return stated_names(store.attributes, counts)
 
 
 def channel_names(store: EpisodeStore, name: str) -> list[str]:
@@ -58,7 +46,7 @@ def captions(store: EpisodeStore, rows: np.ndarray, *, actions: bool) -> list[li
     Returns:
         As many lists as rows, with equally many lines.
     """
-    names = class_names(store)
+    names = store.class_names
     factors = sorted(store.factors, key=lambda name: (store.factors[name].kind, name))
     columns = {}
     if actions and store.actions_spec is not None:

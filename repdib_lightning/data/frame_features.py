@@ -75,7 +75,7 @@ def store_features(
     from tqdm import tqdm
 
     from repdib_lightning.data.frame_network import FrameNetwork
-    from repdib_lightning.evaluation.features import resolve_device
+    from repdib_lightning.devices import resolve_device
 
     weights = None if weights is None else Path(weights)
     network = FrameNetwork(architecture, weights, seed).to(resolve_device(device))

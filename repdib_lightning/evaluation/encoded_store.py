@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from repdib_lightning.data.copies import episode_rows, kept_attributes, kept_of_episode, kept_statement
-from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.outputs import check_output_file
 from repdib_lightning.data.writer import EpisodeWriter
+from repdib_lightning.devices import resolve_device
+from repdib_lightning.evaluation.bundle_data import open_held_out
 from repdib_lightning.evaluation.bundles import bundle_of
-from repdib_lightning.evaluation.features import check_compatible, encode_rows, resolve_device
+from repdib_lightning.evaluation.features import check_compatible, encode_rows
 from repdib_lightning.records import ArraySpec
 
 LATENT, CODES = "latent", "codes"
@@ -32,7 +33,8 @@ def encode_store(
     """Write a data set again with latents and codes in place of its observations; each frame is encoded once.
 
     Observations: ``latent`` (M,) float32, and ``codes`` (G,), whole numbers as float32, where the bottleneck quantises.
-    Actions, rewards, ends of episodes, factors, recordings, the choice of evaluation episodes and the attributes stay.
+    Actions, rewards, ends of episodes, factors, recordings and the attributes stay. Marked for evaluation are the
+    episodes of the values that the encoder's training held out (``data.held_out``), else those that the data mark.
     What was interrupted goes on after its last whole episode when the same command is given again.
 
     Args:
@@ -57,7 +59,7 @@ def encode_store(
     folder = bundle_of(Path(bundle))
     check_output_file(Path(output), "OUTPUT", ".h5", [Path(data)])
     encoder = load_encoder(folder).to(resolve_device(device))
-    store = EpisodeStore(data)
+    store = open_held_out(Path(data), {str(folder): encoder.description})
     check_compatible(encoder, store, str(folder))
     observations = {LATENT: ArraySpec((encoder.features,), "float32")}
     if encoder.groups:

@@ -12,10 +12,11 @@ from repdib_lightning.bottlenecks.group_edits import most_used
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.data.outputs import check_output_file
+from repdib_lightning.devices import resolve_device
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.evaluation.bundle_data import open_held_out
 from repdib_lightning.evaluation.bundles import bundle_of, display_name
-from repdib_lightning.evaluation.features import check_compatible, encode_rows, resolve_device
+from repdib_lightning.evaluation.features import check_compatible, encode_rows
 from repdib_lightning.evaluation.group_drawing import mean_training_picture
 from repdib_lightning.evaluation.picture_grid import picture_lines
 from repdib_lightning.evaluation.redrawing import Redrawing, psnr, redraw

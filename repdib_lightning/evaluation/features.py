@@ -109,20 +109,3 @@ def encode_rows(
     if len(bad):
         raise UserError(f"{store.path}: the encoder returns NaN or infinite values at row {rows[bad[0]]}")
     return latents, codes
-
-
-def resolve_device(device: str) -> torch.device:
-    """``auto`` is the first CUDA device if there is one, else the CPU.
-
-    Raises:
-        UserError: an unknown device, or one that this machine lacks.
-    """
-    if device == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        chosen = torch.device(device)
-        torch.empty(1, device=chosen)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        choices = ["auto", "cpu"] + (["cuda"] if torch.cuda.is_available() else [])
-        raise UserError(f"device '{device}' cannot be used here, {nearest(device, choices)}") from error
-    return chosen

@@ -15,12 +15,13 @@ from tqdm import tqdm
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.outputs import check_output_file
 from repdib_lightning.data.schema import FactorSpec
+from repdib_lightning.devices import resolve_device
 from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation.bundle_data import open_held_out
 from repdib_lightning.evaluation.bundles import bundle_of, display_name, protected_files
 from repdib_lightning.evaluation.codes import FactorBits, codebook_use, factor_bits
 from repdib_lightning.evaluation.decoder import Drawings, check_pictures, measure_pictures
-from repdib_lightning.evaluation.features import Encodes, check_compatible, encode_rows, resolve_device
+from repdib_lightning.evaluation.features import Encodes, check_compatible, encode_rows
 from repdib_lightning.evaluation.group_probe import GroupReport, check_grouped, measure_groups
 from repdib_lightning.evaluation.probe_report import FactorReport, ProbeReport
 from repdib_lightning.evaluation.probes import (

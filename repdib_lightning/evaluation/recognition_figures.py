@@ -8,10 +8,11 @@ import numpy as np
 
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.data.outputs import check_output_file
+from repdib_lightning.devices import resolve_device
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.evaluation.bundle_data import open_held_out
 from repdib_lightning.evaluation.bundles import bundle_of, display_name
-from repdib_lightning.evaluation.features import check_compatible, resolve_device
+from repdib_lightning.evaluation.features import check_compatible
 from repdib_lightning.evaluation.recognition import checked_labels, report_of
 from repdib_lightning.evaluation.recognition_choice import chosen_clips
 from repdib_lightning.evaluation.recognition_clips import ShownClip, clip_figure, shown_clip

@@ -19,7 +19,7 @@ def check_device(name: str) -> None:
 
     Stable-Baselines3 would take the CPU in place of a GPU that is not there, and say nothing.
     """
-    from repdib_lightning.evaluation.features import resolve_device  # not needed where only a name is checked
+    from repdib_lightning.devices import resolve_device  # not needed where only a name is checked
 
     check_device_name(name)
     try:

@@ -19,10 +19,11 @@ from repdib_lightning.bottlenecks import Identity
 from repdib_lightning.callbacks import exit_codes
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.files import whole_file
+from repdib_lightning.devices import resolve_device
 from repdib_lightning.encoders import ConvolutionalEncoder
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError
-from repdib_lightning.evaluation.features import check_compatible, resolve_device, stacked
+from repdib_lightning.evaluation.features import check_compatible, stacked
 from repdib_lightning.export.bundle import save_bundle
 from repdib_lightning.export.frozen import FrozenEncoder
 from repdib_lightning.export.load import load_encoder

@@ -181,6 +181,19 @@ def test_futures_of_pictures_are_refused_with_the_way_out(tmp_path, options, way
     assert len(FutureSampling(store, "train", horizon=1, seed=0, futures=0)) == 5
 
 
+def test_recordings_of_people_are_named_with_their_imports(tmp_path):
+    (tmp_path / "MMAct" / "gyro_clip" / "subject1").mkdir(parents=True)
+    told = str(inspect_store(tmp_path / "MMAct"))
+    assert told.endswith(
+        f"(gyro_clip/); convert: python -m repdib_lightning import mmact {tmp_path}/MMAct data/NAME.h5"
+    )
+    (tmp_path / "watch_dataset.npy").write_bytes(b"any")
+    told = str(inspect_store(tmp_path / "watch_dataset.npy"))
+    assert told.endswith(
+        f"convert: python -m repdib_lightning import smartwatch {tmp_path}/watch_dataset.npy data/NAME.h5"
+    )
+
+
 def test_a_folder_of_the_shape_of_pacs_is_named_with_its_import(tmp_path, capsys):
     source = tmp_path / "PACS"
     for domain in ("cartoon", "photo"):

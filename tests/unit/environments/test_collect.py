@@ -148,7 +148,9 @@ def test_a_workers_error_reaches_the_caller_and_leaves_no_file(tmp_path):
 def test_interrupted_script_without_main_guard_leaves_nothing(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
+        "import signal\n"
         "from repdib_lightning.environments.collect_robot_arm import collect_robot_arm\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests may ignore it\n"
         "print('started', flush=True)\n"
         "collect_robot_arm('out/x.h5', samples=100_000, episode_length=5, image_size=16, workers=1)\n"
     )

@@ -20,7 +20,7 @@ from repdib_lightning.export import load_encoder, save_bundle
 from repdib_lightning.records import ActionSpec, ArraySpec, DataSpec
 
 
-def bundle(folder: Path, quantised: bool, stack: int = 2) -> Path:
+def bundle(folder: Path, quantised: bool, stack: int = 2, **data) -> Path:
     torch.manual_seed(0)
     spec = DataSpec({"front": ArraySpec((3 * stack, 24, 24))}, None, stack)
     encoder = ConvolutionalEncoder(spec, features=8, channels=4, strides=[3, 2])
@@ -28,7 +28,7 @@ def bundle(folder: Path, quantised: bool, stack: int = 2) -> Path:
     if quantised:
         bottleneck = VectorQuantiser(8, groups=2, codes=5, start_step=0)
         bottleneck(torch.randn(64, 8))
-    return save_bundle(folder / "bundle", encoder.eval(), bottleneck.eval(), training={}, data={})
+    return save_bundle(folder / "bundle", encoder.eval(), bottleneck.eval(), training={}, data=data)
 
 
 @pytest.mark.parametrize("quantised", [True, False])
@@ -84,6 +84,9 @@ def test_recordings_names_and_attributes_stay_and_those_of_lost_observations_go(
     assert np.array_equal(made.evaluation, store.evaluation) and store.evaluation.any()
     assert made.attributes["source"] == "people" and made.attributes["seed"] == 3
     assert not {"rate", "channels"} & set(made.attributes)
+    held_out = bundle(tmp_path / "other", False, 1, held_out={"who": ["Ann"]})
+    other = EpisodeStore(encode_store(held_out, tmp_path / "a.h5", tmp_path / "c.h5", progress=False))
+    assert other.evaluation.tolist() == [True] * 4 + [False] * 4, "who the encoder never saw"
 
 
 def test_bad_input_is_one_line_and_nothing_is_written(tmp_path, make_store, capsys):

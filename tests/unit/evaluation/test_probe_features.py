@@ -3,8 +3,9 @@ import pytest
 import torch
 from evaluation_fakes import LENGTH, FakeEncoder, cell_and_video_codes, cell_encoder, write_store
 
+from repdib_lightning.devices import resolve_device
 from repdib_lightning.errors import UserError
-from repdib_lightning.evaluation.features import check_compatible, encode_rows, resolve_device
+from repdib_lightning.evaluation.features import check_compatible, encode_rows
 from repdib_lightning.records import ArraySpec, DataSpec
 
 
