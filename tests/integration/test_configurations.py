@@ -119,6 +119,7 @@ LAYERS = [
     [HAMLET, "activities/keyless", "activities/repdib_fusion"],
     [HAMLET, "activities/repdib_both", "activities/weighting", "activities/sessions"],
     [HAMLET, "activities/smartwatch", "activities/smartwatch_sides", "debug"],
+    [HAMLET, "activities/smartwatch", "activities/statistics"],
     [MMACT, f"{MMACT}_repdib"],
 ]
 ON_A_CPU = ["--trainer.accelerator", "cpu", "--trainer.precision", "32-true"]
