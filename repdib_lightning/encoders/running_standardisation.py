@@ -36,11 +36,14 @@ class RunningStandardisation(nn.Module):
 
     @torch.no_grad()
     def _take_in(self, rows: Tensor, observed: Tensor) -> None:
-        """Merge sums of two parts (Chan et al. 1979), the first of which is what was seen before."""
-        distance = (rows.to(self.mean.dtype) - self.mean).masked_fill(~observed.unsqueeze(-1), 0.0)
-        sums = torch.cat([distance.sum(0), distance.square().sum(0), observed.sum().to(distance.dtype)[None]])
-        first, second, count = sum_over_processes(sums).tensor_split((len(self.mean), 2 * len(self.mean)))
-        total = (self.count + count).clamp_min(1)
-        self.squares.add_(second - first.square() / total)
-        self.mean.add_(first / total)
-        self.count.add_(count.squeeze(0))
+        """Merge the moments of two parts (Chan et al. 1979): what was seen before, and this batch of all processes."""
+        unobserved = ~observed.unsqueeze(-1)
+        rows = rows.to(self.mean.dtype).masked_fill(unobserved, 0.0)
+        sums = sum_over_processes(torch.cat([rows.sum(0), observed.sum().to(rows.dtype)[None]]))
+        count = sums[-1]
+        mean = sums[:-1] / count.clamp_min(1)
+        squares = sum_over_processes((rows - mean).masked_fill(unobserved, 0.0).square().sum(0))
+        share = count / (self.count + count).clamp_min(1)
+        self.squares.add_(squares + (mean - self.mean).square() * self.count * share)
+        self.mean.add_((mean - self.mean) * share)
+        self.count.add_(count)

@@ -11,6 +11,7 @@ from torch.nn.parallel import DistributedDataParallel
 from repdib_lightning.bottlenecks import RepDIB, VectorQuantiser
 from repdib_lightning.encoders import MultimodalEncoder
 from repdib_lightning.encoders.present_rows import pass_present
+from repdib_lightning.encoders.running_standardisation import RunningStandardisation
 
 M, STEPS = 6, 3
 PRESENT = torch.tensor([1, 0, 1, 1, 0, 1, 1, 1]).bool()
@@ -104,11 +105,23 @@ class Detailed(torch.nn.Module):
         return output.features.square().mean() + sum(output.losses.values())
 
 
+def standardise(rank):
+    """Rows of two batches as a process gets them, or one process all of them, and the state after these."""
+    torch.manual_seed(3)
+    module, seen = RunningStandardisation(3), []
+    for _ in range(2):
+        rows, observed = torch.randn(9, 3) * 4 + 9, torch.rand(9) < 0.6
+        if rank is not None:
+            rows, observed = rows.tensor_split([2])[rank], observed.tensor_split([2])[rank]
+        seen.append(module(rows, observed))
+    return {"seen": seen, "state": module.state_dict()}
+
+
 def one_of_two(rank, folder):
     torch.set_num_threads(1)
     distributed.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=2)
     saved = {name: quantise(rank, name) for name in SHARES}
-    torch.save({**saved, **train_distributed(rank)}, f"{folder}/{rank}.pt")
+    torch.save({**saved, **train_distributed(rank), "standardised": standardise(rank)}, f"{folder}/{rank}.pt")
     distributed.destroy_process_group()
 
 
@@ -130,6 +143,15 @@ def test_two_processes_train_on_what_one_would(both, name):
         torch.testing.assert_close((parts[0]["commitment"] + parts[1]["commitment"]) / 2, expected["commitment"])
         gradients = torch.cat([part["gradient"] for part in parts]) / 2
         torch.testing.assert_close(gradients, expected["gradient"])
+    for key, value in alone["state"].items():
+        torch.testing.assert_close(shares[0]["state"][key], value)
+        assert torch.equal(shares[0]["state"][key], shares[1]["state"][key])
+
+
+def test_two_processes_standardise_as_one_would(both):
+    alone, shares = standardise(None), [result["standardised"] for result in both]
+    for batch, expected in enumerate(alone["seen"]):
+        torch.testing.assert_close(torch.cat([share["seen"][batch] for share in shares]), expected)
     for key, value in alone["state"].items():
         torch.testing.assert_close(shares[0]["state"][key], value)
         assert torch.equal(shares[0]["state"][key], shares[1]["state"][key])

@@ -36,7 +36,7 @@ def _mean_step(values):
 def test_standardisation_is_by_all_rows_that_were_observed_in_training():
     torch.manual_seed(0)
     module = RunningStandardisation(3)
-    rows = torch.randn(500, 3) * torch.tensor([1.0, 100.0, 0.0]) + torch.tensor([5.0, -300.0, 7.0])
+    rows = torch.randn(500, 3) * torch.tensor([1.0, 100.0, 0.0]) + torch.tensor([5.0, -300.0, 1234.567])
     observed = torch.rand(500) < 0.7
     for part in torch.arange(500).split(64):
         module(rows[part].masked_fill(~observed[part].unsqueeze(-1), 1e6), observed[part])
