@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from repdib_lightning.evaluation.embedding import tsne
-from repdib_lightning.evaluation.figures import COLOURS, number_classes, panel_grid, plain_axes, png
+from repdib_lightning.evaluation.figures import COLOURS, number_classes, panel_grid, plain_axes, png, slant_names
 from repdib_lightning.evaluation.samples import ProbeSamples
 from repdib_lightning.experiments import statistics
 from repdib_lightning.experiments.comparison import direction
@@ -43,7 +43,7 @@ def seed_points(results: Results, grid: Grid, measures: Sequence[str]) -> bytes 
         panel.set_title(measure + (f"\n{hint.strip()}" if len(measure + hint) > WIDEST_TITLE else hint), fontsize=9)
         panel.set_xticks(range(len(grid.settings)), [setting.name for setting in grid.settings], fontsize=8)
         if crowded:
-            panel.tick_params(axis="x", rotation=40)
+            slant_names(panel)
         panel.set_xlim(-0.6, len(grid.settings) - 0.4)
         if measure.endswith("/kept"):
             panel.set_ylim(-0.03, 1.05)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 
 from repdib_lightning.errors import UserError, nearest
-from repdib_lightning.evaluation.figures import COLOURS, plain_axes, png
+from repdib_lightning.evaluation.figures import COLOURS, plain_axes, png, slant_names
 from repdib_lightning.experiments.comparison import direction
 from repdib_lightning.experiments.figures import HINTS, draw_seeds
 from repdib_lightning.experiments.page import Part
@@ -45,7 +45,7 @@ def overview_figure(results: Results, measure: str) -> bytes:
                 draw_seeds(panel, place, values, colours[setting.name])
         panel.set_title(grid.name, fontsize=10)
         panel.set_xticks(range(len(grid.settings)), [setting.name for setting in grid.settings], fontsize=8)
-        panel.tick_params(axis="x", rotation=40)
+        slant_names(panel)
         panel.set_xlim(-0.6, len(grid.settings) - 0.4)
         plain_axes(panel)
     figure.suptitle(measure + HINTS[direction(measure, results.factors)], fontsize=11)
