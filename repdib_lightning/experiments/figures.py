@@ -120,11 +120,13 @@ def _draw_band(panel: Axes, place: int, setting: str, band: Band) -> None:
 
 
 def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """Below all panels; taken from the one with most lines."""
+    """Below all panels, in as many columns as the figure has room for; taken from the panel with most lines."""
     widest = max(panels, key=lambda panel: len(panel.get_legend_handles_labels()[0]))
     handles, labels = widest.get_legend_handles_labels()
-    columns = min(len(labels), 3 * len(panels))
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
+    width, height = figure.get_size_inches()
+    columns = max(1, min(len(labels), int(width / (0.6 + 0.075 * max(map(len, labels))))))
+    figure.set_size_inches(width, height + 0.2 * (-(-len(labels) // columns) - 1))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
 
 
 def codebook_use(uses: Mapping[str, Sequence[Mapping[str, list[float]]]], codes: int) -> bytes | None:
