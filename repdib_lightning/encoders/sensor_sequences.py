@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor, nn
 
-from repdib_lightning.encoders.clip_steps import finite_only, observed_readings
+from repdib_lightning.encoders.clip_steps import observed_readings
 from repdib_lightning.encoders.recurrence import Recurrence
-from repdib_lightning.encoders.running_standardisation import RunningStandardisation
-from repdib_lightning.encoders.window_statistics import STATISTICS, window_statistics
+from repdib_lightning.encoders.window_convolutions import WindowConvolutions
+from repdib_lightning.encoders.window_statistics import WindowStatistics
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.records import ArraySpec
 
@@ -22,7 +22,7 @@ class SensorSequence(nn.Module):
 
     HAMLET's encoder of sensors (section III-A), with zeros for what is missing after the normalisation: the mean. A
     window is a step of the clip if at least half of its readings were observed. Instead of the convolutions'
-    maximum it can look at standardised statistics of each window (:func:`window_statistics`): data of few people
+    maximum it can look at standardised statistics of each window (:class:`WindowStatistics`): data of few people
     suffice for these.
 
     Args:
@@ -69,13 +69,8 @@ class SensorSequence(nn.Module):
         self.register_buffer("mean", mean, persistent=False)
         self.register_buffer("std", std, persistent=False)
         inputs = 2 * inputs if angles else inputs
-        if network == "convolution":
-            self.convolutions = _convolutions(inputs, channels)
-        else:
-            channels = STATISTICS * inputs
-            self.standardise = RunningStandardisation(channels)
-        self.network = network
-        self.project = nn.Sequential(nn.Linear(channels, width), nn.ReLU(), nn.Dropout(dropout))
+        self.network = WindowConvolutions(inputs, channels) if network == "convolution" else WindowStatistics(inputs)
+        self.project = nn.Sequential(nn.Linear(self.network.width, width), nn.ReLU(), nn.Dropout(dropout))
         self.recurrence = Recurrence(width, layers, dropout)
 
     def forward(self, readings: Tensor) -> tuple[Tensor, Tensor]:
@@ -83,15 +78,9 @@ class SensorSequence(nn.Module):
         share = observed_readings(readings).to(self.mean.dtype).unfold(1, self.window, self.stride).mean(-1)
         observed = share >= 0.5
         windows = self._normalised(readings).unfold(1, self.window, self.stride)  # (N, T', X, window)
-        looked_at = self._look(windows.flatten(0, 1), observed.flatten())
+        looked_at = self.network(windows.flatten(0, 1), observed.flatten())
         steps = self.project(looked_at).unflatten(0, observed.shape)
         return self.recurrence(steps, observed), observed
-
-    def _look(self, windows: Tensor, observed: Tensor) -> Tensor:
-        """(n, X, window) and which were observed, (n,) bool, to (n, channels) or (n, 8 X)."""
-        if self.network == "convolution":
-            return self.convolutions(finite_only(windows)).amax(-1)
-        return self.standardise(window_statistics(windows), observed)
 
     def _normalised(self, readings: Tensor) -> Tensor:
         wide = readings.to(self.mean.dtype)
@@ -99,11 +88,6 @@ class SensorSequence(nn.Module):
             return (wide - self.mean) / self.std
         radians = wide * (math.pi / 180)
         return torch.cat([radians.sin(), radians.cos()], dim=-1)
-
-
-def _convolutions(inputs: int, channels: int) -> nn.Sequential:
-    first = nn.Conv1d(inputs, channels, 3, padding=1)
-    return nn.Sequential(first, nn.ReLU(), nn.Conv1d(channels, channels, 3, padding=1), nn.ReLU())
 
 
 def channel_statistics(array: ArraySpec) -> tuple[Tensor, Tensor]:

@@ -3,10 +3,29 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from repdib_lightning.encoders.running_standardisation import RunningStandardisation
 
 STATISTICS = 8
 """Numbers for each channel."""
+
+
+class WindowStatistics(nn.Module):
+    """Statistics of each channel (:func:`window_statistics`), standardised over the windows of the training.
+
+    Args:
+        inputs: X.
+    """
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.width = STATISTICS * inputs
+        self.standardise = RunningStandardisation(self.width)
+
+    def forward(self, windows: Tensor, observed: Tensor) -> Tensor:
+        """(n, X, window), which may have NaN, and which windows count, (n,) bool, to (n, 8 X)."""
+        return self.standardise(window_statistics(windows), observed)
 
 
 def window_statistics(windows: Tensor) -> Tensor:
