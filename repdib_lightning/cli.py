@@ -41,8 +41,12 @@ from repdib_lightning.option_errors import one_line
 from repdib_lightning.quiet import quieten_lightning
 from repdib_lightning.representation import RepresentationModule
 from repdib_lightning.resuming import check_idle, check_same_data, check_unchanged
+from repdib_lightning.rl.exploration.callbacks import ExplorationProgress, Snapshots
+from repdib_lightning.rl.exploration.data import ExplorationDataModule
+from repdib_lightning.rl.exploration.module import ExplorationModule
 
 DEFAULT = "robot_arm"
+_DATA = (EpisodeDataModule, MazeDataModule, RobotArmDataModule, ExplorationDataModule)
 SLOTS: dict[str, list[str]] = {
     "model.encoder": list(ENCODERS),
     "model.bottleneck": list(BOTTLENECKS),
@@ -50,7 +54,7 @@ SLOTS: dict[str, list[str]] = {
     "model.objective.classifier": list(CLASSIFIERS),
     "model.objective.decoder": list(DECODERS),
     "model.optimizer": [name for name, item in vars(torch.optim).items() if isinstance(item, type)],
-    "data": [EpisodeDataModule.__name__, MazeDataModule.__name__, RobotArmDataModule.__name__],
+    "data": [module.__name__ for module in _DATA],
 }
 """Key of a slot in the configuration -> names of the classes that fit it."""
 
@@ -99,7 +103,10 @@ class TrainingCLI(LightningCLI):
         kwargs |= {"default_root_dir": str(self.folder), "plugins": [*(given.plugins or []), *run_plugins()]}
         kwargs["use_distributed_sampler"] = False  # the loaders give each process its own share
         safety = run_callbacks(self.folder, config.checkpoint_every, config.checkpoint_keep)
-        self.trainer_defaults = {"callbacks": [Pictures(), Redrawn(), CodebookUse(), Confusion(), *safety]}
+        shown = [Pictures(), Redrawn(), CodebookUse(), Confusion()]
+        if isinstance(self.datamodule, ExplorationDataModule):
+            shown = [Pictures(), ExplorationProgress(), Snapshots()]
+        self.trainer_defaults = {"callbacks": [*shown, *safety]}
         return super().instantiate_trainer(**kwargs)
 
     def configuration(self) -> str:
@@ -134,6 +141,8 @@ def fit(arguments: list[str]) -> int:
         _say(f"stopped: {cli.folder}    go on: python -m repdib_lightning fit --resume {shlex.quote(str(cli.folder))}")
         raise
     finally:
+        if isinstance(cli.datamodule, ExplorationDataModule):
+            cli.datamodule.close()
         run_folder.remove_stillborn(cli.folder)
     _say(f"finished: {cli.folder}    next: python -m repdib_lightning export {shlex.quote(str(cli.folder))}")
     return 0
@@ -142,6 +151,8 @@ def fit(arguments: list[str]) -> int:
 def _open(cli: TrainingCLI) -> None:
     """Try everything that can go wrong with data, model and options, then make the run's folder or go on in it."""
     resumed, configuration = cli.checkpoint is not None, cli.configuration()
+    if isinstance(cli.datamodule, ExplorationDataModule):
+        cli.datamodule.folder = cli.folder
     run_folder.check_new(cli.folder, exist_ok=resumed)
     if resumed:
         check_idle(cli.folder)
@@ -150,12 +161,12 @@ def _open(cli: TrainingCLI) -> None:
         cli.datamodule.prepare_data()
     cli.datamodule.setup("fit")
     if resumed:
-        check_same_data(cli.folder, cli.datamodule.store)
+        check_same_data(cli.folder, cli.datamodule.facts)
     cli.datamodule.train_dataloader()
     with _one_line_errors(cli.parser):
         cli.model.build(cli.datamodule.spec).configure_optimizers()
     cli.model.rehearse(cli.datamodule.example())  # an error in somebody's own part keeps its traceback
-    run_folder.open_run(cli.folder, configuration, cli.datamodule.store, resumed=resumed)
+    run_folder.open_run(cli.folder, configuration, cli.datamodule.facts, resumed=resumed)
     if not resumed:
         _describe_model(cli)
 
@@ -190,15 +201,11 @@ def _refuse(config: Namespace) -> None:
 @rank_zero_only
 def _describe_model(cli: TrainingCLI) -> None:
     """Write into the run's folder what ``export`` needs to build encoder and bottleneck again."""
-    store = cli.datamodule.store
     training = {"objective": cli.model.objective.label, "run": cli.folder.name}
-    data = {"file": store.path.name, "fingerprint": store.fingerprint}
-    if held_out := cli.datamodule.held_out:
-        data["held_out"] = held_out
     found = {"decoder": cli.model.objective.find_decoder(), "classifier": cli.model.objective.find_classifier()}
     heads = {key: head for key, head in found.items() if head is not None}
     modules = (cli.model.encoder, cli.model.bottleneck)
-    write_model_description(cli.folder, *modules, training=training, data=data, heads=heads)
+    write_model_description(cli.folder, *modules, training=training, data=cli.datamodule.facts, heads=heads)
 
 
 def validate(arguments: list[str]) -> int:
@@ -217,6 +224,8 @@ def _evaluate(verb: str, arguments: list[str]) -> int:
     elif not {"-h", "--help"} & set(arguments):
         raise UserError(f"{verb}: needs the folder of a run: python -m repdib_lightning {verb} runs/NAME")
     cli = _prepare(_with_run("--resume", arguments))
+    if isinstance(cli.datamodule, ExplorationDataModule):
+        raise UserError(f"{verb} {cli.folder}: an exploration has no held-out losses; export it, and probe its bundle")
     cli.datamodule.setup(verb)
     cli.model.build(cli.datamodule.spec)
     plain = {"logger": False, "callbacks": None, "plugins": run_plugins(), "use_distributed_sampler": False}
@@ -234,8 +243,9 @@ def _prepare(arguments: list[str]) -> TrainingCLI:
         expanded = ["--config", str(configurations.resolve(DEFAULT)), *expanded]
     command = "python -m repdib_lightning fit"
     parser = {"exit_on_error": False, "allow_abbrev": False, "prog": command, "usage": f"{command} [--KEY VALUE ...]"}
+    explores = configurations.chosen_class(expanded, "data") == ExplorationDataModule.__name__
     return TrainingCLI(
-        RepresentationModule,
+        ExplorationModule if explores else RepresentationModule,
         pl.LightningDataModule,
         subclass_mode_data=True,
         save_config_callback=None,

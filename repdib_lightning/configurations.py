@@ -63,3 +63,22 @@ def expand(arguments: list[str]) -> list[str]:
         expects_name = not expects_name and argument in ("--config", "-c")
         expanded.append("--config" if argument == "-c" else argument)
     return expanded
+
+
+def chosen_class(arguments: list[str], slot: str) -> str:
+    """The class that expanded arguments choose for a slot such as ``data``, without its module; "" if they choose none.
+
+    Args:
+        arguments: of :func:`expand`. slot: its name.
+    """
+    chosen = ""
+    for place, argument in enumerate(arguments):
+        option, equals, value = argument.partition("=")
+        value = value if equals else "".join(arguments[place + 1 : place + 2])
+        if option == "--config" and value:
+            tree = yaml.safe_load(Path(value).read_text())
+            block = tree.get(slot) if isinstance(tree, dict) else None
+            chosen = str(block.get("class_path", chosen)) if isinstance(block, dict) else chosen
+        elif option in (f"--{slot}", f"--{slot}.class_path") and value:
+            chosen = value
+    return chosen.rpartition(".")[2]

@@ -10,6 +10,8 @@ _HARMLESS = (
     ".*LightningCLI's args parameter.*",
     ".*exists and is not empty.*",
     ".*treespec.*",
+    ".*defined a `validation_step` but have no `val_dataloader`.*",
+    ".*module\\(s\\) in eval mode at the start of training.*",
 )
 
 

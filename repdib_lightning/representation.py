@@ -20,6 +20,7 @@ from repdib_lightning.loss_weights import DEFAULT_LOSS_WEIGHTS
 from repdib_lightning.means import SampleMeans
 from repdib_lightning.objectives.base import Objective
 from repdib_lightning.records import Batch, BottleneckOutput, DataSpec, ObjectiveOutput
+from repdib_lightning.target_network import TargetNetwork
 
 
 class RepresentationModule(pl.LightningModule):
@@ -42,12 +43,14 @@ class RepresentationModule(pl.LightningModule):
         scheduler_interval: when the scheduler advances, after every ``step`` or every ``epoch``.
 
     Attributes:
+        target: the slowly following copy of encoder and bottleneck, where the objective has a ``target_rate``.
         tables: what the last evaluation gave beside numbers, such as ``confusion``, over all processes.
     """
 
     encoder: Encoder
     bottleneck: Bottleneck
     objective: Objective
+    target: TargetNetwork | None
 
     def __init__(
         self,
@@ -69,6 +72,7 @@ class RepresentationModule(pl.LightningModule):
         self.warmup = warmup or {}
         self.shift = shift
         self.scheduler_interval = scheduler_interval
+        self.target = None
         self.tables: dict[str, Tensor] = {}
         self._held_out = SampleMeans()
         self._held_out_metrics: dict[str, MetricCollection] = {}
@@ -87,6 +91,8 @@ class RepresentationModule(pl.LightningModule):
         self.bottleneck = for_positions(self.build_bottleneck, self.encoder.features, self.encoder.positions)
         self.objective = self.build_objective(self.encoder.features, spec)
         self._check_drawing()
+        rate = self.objective.target_rate
+        self.target = TargetNetwork(self.encoder, self.bottleneck, rate) if rate > 0 else None
         return self
 
     def _check_drawing(self) -> None:
@@ -121,12 +127,27 @@ class RepresentationModule(pl.LightningModule):
                 )
 
     def configure_optimizers(self) -> Any:
-        """One optimiser over all parameters, and its scheduler."""
-        optimizer = self.build_optimizer(self.parameters())
+        """One optimiser over all parameters but the target's, and its scheduler."""
+        averages = set() if self.target is None else set(self.target.parameters())
+        optimizer = self.build_optimizer([weight for weight in self.parameters() if weight not in averages])
         if self.build_scheduler is None:
             return optimizer
         scheduler = {"scheduler": self.build_scheduler(optimizer), "interval": self.scheduler_interval}
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
+
+    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+        """Step, then let the target follow. Not called under manual optimisation: see :meth:`follow_target`."""
+        super().optimizer_step(*args, **kwargs)
+        self.follow_target()
+
+    def follow_target(self) -> None:
+        """Take the target, and the objective's own, one step towards what they follow; without one, do nothing.
+
+        Once after each optimiser step, by whoever steps the optimiser.
+        """
+        if self.target is not None:
+            self.target.follow(self.encoder, self.bottleneck)
+            self.objective.follow()
 
     def forward(self, observations: dict[str, Tensor]) -> BottleneckOutput:
         """Pass name -> (N, *shape) through encoder and bottleneck, without augmentation."""
@@ -143,7 +164,7 @@ class RepresentationModule(pl.LightningModule):
         output = self._evaluate(batch)
         terms = {name: value * self._weight(name) for name, value in output.losses.items()}
         loss = torch.stack(list(terms.values())).sum()
-        values = _named("train", loss, output, terms)
+        values = named_values("train", loss, output, terms)
         self._log(values if self._writes_this_step() else {name: values[name] for name in values if _shown(name)})
         return {"loss": loss, "terms": {name: value.detach() for name, value in output.losses.items()}}
 
@@ -179,7 +200,7 @@ class RepresentationModule(pl.LightningModule):
     def _add_held_out(self, stage: str, batch: Batch) -> None:
         output = self._evaluate(batch)
         terms = {name: value * self.loss_weights.get(name, 1.0) for name, value in output.losses.items()}
-        self._held_out.add(_named(stage, torch.stack(list(terms.values())).sum(), output, terms), len(batch))
+        self._held_out.add(named_values(stage, torch.stack(list(terms.values())).sum(), output, terms), len(batch))
         for name, metrics in self._held_out_metrics.items():
             metrics.update(*output.updates[name])
 
@@ -199,17 +220,29 @@ class RepresentationModule(pl.LightningModule):
 
         def encode(observations: dict[str, Tensor]) -> Tensor:
             assert not bottlenecks, "an objective encodes all its frames in one pass"
-            lead = next(iter(observations.values())).shape[:2]
-            flat = {name: self._augment(array.flatten(0, 1)) for name, array in observations.items()}
+            flat, lead = self._frames(observations)
             output = self(flat)
             bottlenecks.append(output)
             return output.latent.unflatten(0, lead)
 
-        objective: ObjectiveOutput = self.objective(batch, encode)
+        targets = () if self.target is None else (self._encode_by_target,)
+        objective: ObjectiveOutput = self.objective(batch, encode, *targets)
         for output in bottlenecks:
             objective.losses |= output.losses
             objective.metrics |= output.metrics
         return objective
+
+    def _encode_by_target(self, observations: dict[str, Tensor]) -> Tensor:
+        """Name -> (B, F, *shape) to the target's latents (B, F, M), with shifts of their own in training."""
+        assert self.target is not None
+        flat, lead = self._frames(observations)
+        latents: Tensor = self.target(flat)
+        return latents.unflatten(0, lead)
+
+    def _frames(self, observations: dict[str, Tensor]) -> tuple[dict[str, Tensor], torch.Size]:
+        """Augmented frames, name -> (B * F, *shape), and (B, F)."""
+        lead = next(iter(observations.values())).shape[:2]
+        return {name: self._augment(array.flatten(0, 1)) for name, array in observations.items()}, lead
 
     def _augment(self, observation: Tensor) -> Tensor:
         picture = observation.dtype == torch.uint8 and observation.ndim in (4, 5)
@@ -237,8 +270,13 @@ def _shown(name: str) -> bool:
     return name.partition("/")[2] in ("loss", "accuracy", "f1_macro", "action_accuracy", "contrast_accuracy")
 
 
-def _named(stage: str, loss: Tensor, output: ObjectiveOutput, terms: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Everything that is logged of one batch, under the same names everywhere."""
+def named_values(stage: str, loss: Tensor, output: ObjectiveOutput, terms: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Everything that is logged of one batch, under the same names everywhere.
+
+    Args:
+        stage: ``train``, ``val`` or ``test``.
+        loss: the weighted sum. output: of the objective. terms: the weighted losses.
+    """
     values = {f"{stage}/loss": loss.detach()}
     values |= {f"{stage}/raw/{name}": value.detach() for name, value in output.losses.items()}
     values |= {f"{stage}/weighted/{name}": value.detach() for name, value in terms.items()}

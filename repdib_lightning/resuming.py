@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from repdib_lightning.callbacks import read_status
-from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.errors import UserError
 
 _FIXED = ("seed_everything", "model", "data")
@@ -44,14 +43,14 @@ def check_unchanged(folder: Path, saved: str, now: str) -> None:
             )
 
 
-def check_same_data(folder: Path, store: EpisodeStore) -> None:
-    """Raise UserError if the data file's content is not what the run was started on."""
+def check_same_data(folder: Path, data: Mapping[str, Any]) -> None:
+    """Raise UserError if the data, of which file and fingerprint are told, are not what the run was started on."""
     facts = folder / "environment.json"
     if not facts.is_file():
         return
     started_on = json.loads(facts.read_text())["data"]["fingerprint"]
-    if started_on and started_on != store.fingerprint:
-        raise UserError(f"--resume {folder}: {store.path} holds other data than the run was started on (fingerprint)")
+    if started_on and started_on != data["fingerprint"]:
+        raise UserError(f"--resume {folder}: {data['file']} holds other data than the run was started on (fingerprint)")
 
 
 def _leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

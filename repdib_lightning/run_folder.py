@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
-from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.versions import versions
@@ -18,10 +19,11 @@ CONFIGURATION = "config.yaml"
 
 
 @rank_zero_only
-def open_run(folder: Path, configuration: str, store: EpisodeStore, *, resumed: bool) -> None:
+def open_run(folder: Path, configuration: str, data: Mapping[str, Any], *, resumed: bool) -> None:
     """Make the run's folder (or go on in it) and write config.yaml and environment.json.
 
-    Called when the options, the data and the model are known to be good, just before training.
+    ``data`` tells its file and fingerprint. Called when the options, the data and the model are known to be good, just
+    before training.
 
     Raises:
         UserError: a new run's folder exists, or the folder cannot be written.
@@ -30,7 +32,7 @@ def open_run(folder: Path, configuration: str, store: EpisodeStore, *, resumed: 
     with whole_file(folder / CONFIGURATION) as path:
         path.write_text(configuration)
     if not resumed:
-        facts = {"versions": versions(), "data": {"file": store.path.name, "fingerprint": store.fingerprint}}
+        facts = {"versions": versions(), "data": {name: data[name] for name in ("file", "fingerprint")}}
         with whole_file(folder / "environment.json") as path:
             path.write_text(json.dumps(facts, indent=1) + "\n")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
+from typing import Any
 
 import lightning.pytorch as pl
 import torch
@@ -131,6 +132,13 @@ class EpisodeDataModule(pl.LightningDataModule):
         classes = tuple(self.store.value_names(self.target)) if self.target else ()
         actions = self.store.actions_spec
         return DataSpec(observations, actions, self.frame_stack, horizon, self.next_frame, self.target, classes)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Plain facts of the data for a run's folder and for bundles. Only after :meth:`setup`."""
+        assert self.store is not None, "setup() opens the store first"
+        facts: dict[str, Any] = {"file": self.store.path.name, "fingerprint": self.store.fingerprint}
+        return facts | ({"held_out": self.held_out} if self.held_out else {})
 
     def example(self, count: int = 2) -> Batch:
         """Some held-out samples, evenly spread, since neighbours may be alike. Only after :meth:`setup`."""

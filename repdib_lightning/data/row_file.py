@@ -6,7 +6,9 @@ places, so that the file is readable whenever the process is killed, and a faile
 
 from __future__ import annotations
 
+import mmap
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import h5py
@@ -105,6 +107,19 @@ class RowFile:
         if count and (lengths.min() < 1 or ends[-1] > self.rows or (self._starts[:count] != ends - lengths).any()):
             raise KeyError("its episodes do not follow each other")
         return lengths
+
+    def forget_after(self, episodes: int) -> None:
+        """Let the file hold its first episodes only; their rows may be written again. Raises OSError."""
+        forgotten = np.arange(episodes, len(self._lengths))
+        if self._lengths[forgotten].any():
+            self._lengths[forgotten] = 0
+            self.write("episodes/length", episodes, self._lengths[forgotten])
+            self.flush()
+
+    def mapped(self, keys: Sequence[str]) -> tuple[mmap.mmap, dict[str, tuple[int, int]]]:
+        """The whole file mapped into memory, read-only, and where the arrays lie: offset of row 0, bytes a row."""
+        whole = mmap.mmap(self._handle, 0, access=mmap.ACCESS_READ)
+        return whole, {key: self._places[key] for key in keys}
 
     def read(self, key: str, first: int, count: int) -> np.ndarray:
         """Bytes of ``count`` rows: (count, bytes a row) uint8. Raises OSError."""

@@ -21,6 +21,7 @@ from repdib_lightning.data.episode_checks import (
 )
 from repdib_lightning.data.files import sync_directory
 from repdib_lightning.data.fingerprint import ContentHash
+from repdib_lightning.data.growing import GrowingArrays
 from repdib_lightning.data.partial import open_partial, partial_of
 from repdib_lightning.data.row_file import RowFile, make_empty
 from repdib_lightning.data.schema import FactorSpec
@@ -54,6 +55,7 @@ class EpisodeWriter:
         recordings: whether each episode states the recording that it was cut of.
         overwrite: replace an existing file; with ``resume``, discard an unfinished recording, too.
         resume: keep what an interruption leaves, and go on with it.
+        keep: with ``resume``, go on after this many episodes and forget later ones; None keeps all.
 
     Raises:
         UserError: the path exists or is a folder, cannot be written, the disk is full, or what is stated cannot be a
@@ -77,7 +79,9 @@ class EpisodeWriter:
         recordings: bool = False,
         overwrite: bool = False,
         resume: bool = False,
+        keep: int | None = None,
     ) -> None:
+        assert keep is None or resume
         self.path = Path(path)
         if self.path.is_dir():
             raise UserError(f"{self.path}: is a folder; name a file, such as {self.path / 'NAME.h5'}")
@@ -100,9 +104,9 @@ class EpisodeWriter:
             remove_leftovers(self.path)
             self._check_space(observations)
             self._file = self._open(statement)
-            self._go_on()
+            self._go_on(keep)
         except BaseException as error:
-            self._discard()
+            self.close()
             if isinstance(error, _REFUSED) and not isinstance(error, UserError):
                 raise self._cannot_write(error) from error
             raise
@@ -112,15 +116,25 @@ class EpisodeWriter:
         """How many episodes are written; with ``resume`` those of earlier, interrupted recordings count."""
         return self._episode
 
+    def arrays(self) -> GrowingArrays:
+        """What is written, as it grows."""
+        assert self._file is not None
+        return GrowingArrays(self._file, self._columns)
+
     def _open(self, statement: Statement) -> RowFile:
         if self._resume:
             return open_partial(self.path, statement, self._temporary, begin_anew=self._overwrite)
         make_empty(self._temporary, statement)
         return RowFile(self._temporary, os.open(self._temporary, os.O_RDWR))
 
-    def _go_on(self) -> None:
+    def _go_on(self, keep: int | None) -> None:
         """Hash the episodes that are there, one at a time."""
         assert self._file is not None
+        if keep is not None:
+            there = len(self._file.lengths())
+            if there < keep:
+                raise UserError(f"{partial_of(self.path)}: holds {there} episodes, {keep} are to be gone on with")
+            self._file.forget_after(keep)
         for length in map(int, self._file.lengths()):
             rows = {key: self._file.read(key, self._row, length) for key in self._columns}
             evaluation = bool(self._file.read("episodes/evaluation", self._episode, 1)[0, 0])
@@ -218,9 +232,10 @@ class EpisodeWriter:
             if kind is None:
                 self._publish()
         finally:
-            self._discard()
+            self.close()
 
-    def _discard(self) -> None:
+    def close(self) -> None:
+        """Give the file back; what was written is kept with ``resume``, and gone without."""
         if self._file is not None:
             file, self._file = self._file, None
             if self._resume:

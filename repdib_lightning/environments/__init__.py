@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from repdib_lightning.environments.urlb_tasks import URLB_TASKS, gymnasium_name
+
 COLLECTORS = {
     "activities": "repdib_lightning.environments.collect_activities:collect_activities",
     "control": "repdib_lightning.environments.collect_control:collect_control",
@@ -15,9 +19,21 @@ COLLECTORS = {
 """Environment -> ``module:function`` that records a data set of it: ``function(path, *, seed, overwrite, ...)``."""
 
 _MAZES = ("GridWorld", "SpiralWorld", "LoopWorld")
+_CHOSEN: dict[str, dict[str, Any]] = {
+    **{f"repdib/{world}-v0": {"world": world} for world in _MAZES},
+    **{
+        f"repdib/{gymnasium_name(task)}-v0": {"world": task, "image_size": 84, "action_repeat": 2, "frame_stack": 3}
+        for task in URLB_TASKS
+    },
+}
+"""Identifier -> arguments that differ from the constructor's defaults; of URLB's tasks, URLB's."""
 
 GYMNASIUM_IDS = {
     **{f"repdib/{world}-v0": "repdib_lightning.environments.maze_env:MazeEnv" for world in _MAZES},
+    **{
+        f"repdib/{gymnasium_name(task)}-v0": "repdib_lightning.environments.control_env:ControlEnv"
+        for task in URLB_TASKS
+    },
     "repdib/Control-v0": "repdib_lightning.environments.control_env:ControlEnv",
     "repdib/RobotArm-v0": "repdib_lightning.environments.robot_arm_env:RobotArmEnv",
 }
@@ -35,6 +51,5 @@ def register() -> None:
 
     for name, entry_point in GYMNASIUM_IDS.items():
         if name not in gymnasium.registry:
-            world = name.removeprefix("repdib/").removesuffix("-v0")
-            chosen = {"world": world} if world in _MAZES else {}
+            chosen = dict(_CHOSEN.get(name, {}))
             gymnasium.register(name, entry_point=entry_point, vector_entry_point=_VECTORISED.get(name), kwargs=chosen)

@@ -1,7 +1,8 @@
-"""The Control Suite from pixels, amid distractors, as a gymnasium environment."""
+"""The Control Suite and URLB from pixels, amid distractors, as a gymnasium environment."""
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any
 
 import gymnasium
@@ -13,20 +14,22 @@ from repdib_lightning.environments.control_scene import ControlCamera, Place, Qu
 from repdib_lightning.environments.control_task import ControlTask
 from repdib_lightning.errors import UserError
 
+_DEFAULT = "walker-walk"
 _STARTS_TRIED = 8
 """Starts of episodes in which the sky is looked for."""
 
 
 class ControlEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """A task of the DeepMind Control Suite, filmed by its own camera (paper, offline visual control).
+    """A task of the DeepMind Control Suite or of URLB, filmed by its own camera (paper, offline visual control and
+    exploration).
 
-    Observations: (3, H, W) uint8, not stacked; W is half as much wider with a distractor at the side. Actions: (A,)
-    float32 in [-1, 1]. Rewards are summed over the action repeat: a return is between 0 and 1000. Episodes are
-    truncated after 1000 control steps. ``info["factors"]`` holds the ground truth: what the task observes of its state,
-    and what plays behind.
+    Observations: (3 F, H, W) uint8, F frames stacked, the oldest first; W is half as much wider with a distractor at
+    the side. Actions: (A,) float32 in [-1, 1]. Rewards are summed over the action repeat: a return is between 0 and
+    1000. Episodes are truncated after 1000 control steps (``jaco``: 250 of both). ``info["factors"]`` holds the ground
+    truth: what the task observes of its state, and what plays behind.
 
     Args:
-        task: such as ``walker-walk``.
+        task: such as ``walker-walk``, the default.
         image_size: height of the picture in pixels (64 and 84 are usual), 16 to 512.
         action_repeat: control steps an action is held for.
         quality: ``fast`` or ``paper``; see :class:`~repdib_lightning.environments.control_scene.ControlCamera`.
@@ -36,6 +39,8 @@ class ControlEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             :mod:`repdib_lightning.environments.distractors`. Empty for the built-in one.
         distractor_seed: decides which clips are held out, and what built-in ones look like.
         evaluation: show held-out clips instead of the training ones.
+        frame_stack: F; the first frame is repeated when an episode begins.
+        world: the task, where a gymnasium id such as ``repdib/WalkerRun-v0`` decides it.
         render_mode: ``rgb_array`` or None.
 
     Raises:
@@ -47,7 +52,7 @@ class ControlEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        task: str = "walker-walk",
+        task: str | None = None,
         *,
         image_size: int = 64,
         action_repeat: int = 2,
@@ -57,20 +62,30 @@ class ControlEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         source: str = "",
         distractor_seed: int = 0,
         evaluation: bool = False,
+        frame_stack: int = 1,
+        world: str | None = None,
         render_mode: str | None = None,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise UserError(f"render_mode={render_mode}: must be rgb_array or None")
         self.render_mode, self.evaluation = render_mode, evaluation
         check_picture(image_size, quality)
-        self.task = ControlTask(task, action_repeat)
+        if frame_stack < 1:
+            raise UserError(f"frame_stack={frame_stack}: must be at least 1")
+        if task is not None and world is not None:
+            raise UserError(
+                f"task={task}: the task is {world}; leave it out, or take repdib/Control-v0 for another one"
+            )
+        chosen = world if task is None else task
+        self.task = ControlTask(_DEFAULT if chosen is None else chosen, action_repeat)
         self.backgrounds = Backgrounds(distractors, place, source, distractor_seed, image_size)
         self.camera = ControlCamera(self.task, image_size, quality, self.backgrounds.through)
         self._check_place()
-        shape = (3, image_size, image_size + self.backgrounds.panel)
+        shape = (3 * frame_stack, image_size, image_size + self.backgrounds.panel)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.task.actions,), np.float32)
         self._playing, self._step = Playing(0, 0), 0
+        self._frames: deque[np.ndarray] = deque(maxlen=frame_stack)
 
     def _check_place(self) -> None:
         """Refuse a sky that the camera, looking down, does not see."""
@@ -92,13 +107,21 @@ class ControlEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         physics, drawing = (np.random.default_rng(part) for part in self.np_random.integers(2**63, size=2))
         self.task.reset(physics)
         self._playing, self._step = self.backgrounds.draw(drawing, self.evaluation), 0
-        return self._observe(), self._info()
+        self._frames.clear()
+        return self._stacked(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Hold an action for the action repeat."""
         reward, terminated, truncated = self.task.step(action)
         self._step += 1
-        return self._observe(), reward, terminated, truncated, self._info()
+        return self._stacked(), reward, terminated, truncated, self._info()
+
+    def _stacked(self) -> np.ndarray:
+        """(3 F, H, W): the frame of the moment behind the ones before."""
+        frame = self._observe()
+        missing = (self._frames.maxlen or 1) - len(self._frames)
+        self._frames.extend([frame] * max(1, missing))
+        return frame if self._frames.maxlen == 1 else np.concatenate(self._frames)
 
     def _observe(self) -> np.ndarray:
         return self.backgrounds.shown(self.camera.see(self.task), self._playing, self._step)
@@ -107,7 +130,7 @@ class ControlEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return {"factors": {**self.task.factors(), **self.backgrounds.factors(self._playing, self._step)}}
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """(H, W, 3) uint8: the observation; None without ``render_mode="rgb_array"``."""
+        """(H, W, 3) uint8: the newest frame; None without ``render_mode="rgb_array"``."""
         return None if self.render_mode is None else self._observe().transpose(1, 2, 0)
 
     def close(self) -> None:

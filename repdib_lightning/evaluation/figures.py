@@ -24,10 +24,10 @@ COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 SHOULD = {"endogenous": "State kept (high is good)", "exogenous": "Noise kept (low is good)"}
 
 
-def png(figure: Figure) -> bytes:
+def png(figure: Figure, dpi: int = 110) -> bytes:
     """Draw a figure, small and opaque; the same figure gives the same bytes."""
     drawn, opaque = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=110)
+    figure.savefig(drawn, format="png", dpi=dpi)
     Image.open(drawn).convert("RGB").save(opaque, "PNG", optimize=True)
     return opaque.getvalue()
 

@@ -122,7 +122,8 @@ class Attempt:
         return [run, str(self.point.setting.data), *kept, *chosen]
 
     def _finetune_options(self, name: str) -> list[str]:
-        encoder = ["--encoder", str(self.point.folder / "bundle")] if self.point.setting.pretrained else []
+        given = self.point.encoder_of(name)
+        encoder = [] if given is None else ["--encoder", str(given)]
         return [*self.point.finetune[name], *encoder, "--run", str(self.point.finetune_folder(name))]
 
     def _command(self, words: list[str], handle: int) -> tuple[int, str]:
@@ -168,7 +169,8 @@ def _complete(point: Point, record: Record) -> None:
     for name, value in facts.metrics.items():
         if not math.isfinite(value):
             raise UserError(f"{name} is {value}")
-    record.configuration, record.versions, record.data = facts.configuration, facts.versions, facts.data
+    record.configuration, record.versions = facts.configuration, facts.versions
+    record.data, record.probed = facts.data, facts.probed
     record.factors, record.metrics, record.threads = facts.factors, facts.metrics, point.suite.threads
     record.finished = True
 

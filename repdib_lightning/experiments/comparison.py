@@ -9,6 +9,7 @@ import numpy as np
 
 from repdib_lightning.experiments import statistics
 from repdib_lightning.experiments.results import Results
+from repdib_lightning.experiments.snapshots import MONOTONE
 from repdib_lightning.experiments.statistics import Estimate
 from repdib_lightning.experiments.suite import Grid
 from repdib_lightning.rl import AGENTS
@@ -17,7 +18,7 @@ Direction = Literal["up", "down", ""]
 
 _REACHED = (
     *("return", "success", "solved", "coverage", "entropy", "topology", "topology_pairs"),
-    *("mean_return", "mean_success", "final_success", "mean_coverage"),
+    *("mean_return", "mean_success", "final_success", "mean_coverage", MONOTONE),
 )
 _NEEDED = ("steps_to_solve", "moves")
 _NEITHER_OF_RECOGNITION = ("weight", "perplexity")
@@ -59,7 +60,8 @@ def direction(measure: str, factors: dict[str, str]) -> Direction:
     """Whether more of a measure is better (``up``), less is (``down``), or neither.
 
     State and agent should be kept, noise and background dropped; an error is what was not kept. Of fine-tuning
-    (``AGENT/NAME/...``), what was reached should be high, what it took should be low. Groups should hold, draw and move
+    (``AGENT/NAME/...``), what was reached should be high, what it took should be low; an exploration should reach much,
+    without a reward. Groups should hold, draw and move
     different factors; how much one of them holds or draws alone says nothing of that.
     """
     if measure.startswith("codes/"):
@@ -68,6 +70,8 @@ def direction(measure: str, factors: dict[str, str]) -> Direction:
         return "" if measure.rpartition("/")[2] in _NEITHER_OF_GROUPS else "up"
     if measure.startswith("recognition/"):
         return "" if measure.split("/")[1] in _NEITHER_OF_RECOGNITION else "up"
+    if measure.startswith("explore/"):
+        return "up" if measure.startswith("explore/coverage") else ""
     if measure.startswith("val/"):
         reached = measure.endswith("accuracy") or measure.startswith("val/f1")
         return "up" if reached else "down" if measure == "val/loss" or "/raw/" in measure else ""

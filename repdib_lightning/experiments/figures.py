@@ -76,7 +76,7 @@ def curves_with_bands(grid: Grid, columns: Mapping[str, Mapping[str, Band]]) -> 
         panel.set_title(column, fontsize=10)
         panel.set_xlabel("step", fontsize=9)
         plain_axes(panel)
-    _legend(figure, panels)
+    legend_below(figure, panels)
     return png(figure)
 
 
@@ -108,18 +108,22 @@ def learning_curves_figure(
         if column.rpartition("/")[2] in ("success", "coverage", "entropy"):
             panel.set_ylim(-0.03, 1.03)
         plain_axes(panel)
-    _legend(figure, panels)
+    legend_below(figure, panels)
     return png(figure)
 
 
 def _draw_band(panel: Axes, place: int, setting: str, band: Band) -> None:
     colour, line = COLOURS[place % len(COLOURS)], _LINES[place // len(COLOURS) % len(_LINES)]
+    draw_band(panel, band, f"{setting} (n={band.seeds})", colour, line)
+
+
+def draw_band(panel: Axes, band: Band, label: str, colour: str, line: str = "-") -> None:
+    """The mean over seeds and its interval."""
     panel.fill_between(band.steps, band.low, band.high, color=colour, alpha=0.2, linewidth=0)
-    label = f"{setting} (n={band.seeds})"
     panel.plot(band.steps, band.mean, color=colour, linestyle=line, linewidth=1.3, label=label)
 
 
-def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
+def legend_below(figure: Figure, panels: Sequence[Axes]) -> None:
     """Below all panels, in as many columns as the figure has room for; taken from the panel with most lines."""
     widest = max(panels, key=lambda panel: len(panel.get_legend_handles_labels()[0]))
     handles, labels = widest.get_legend_handles_labels()

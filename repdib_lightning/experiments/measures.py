@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
+from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation.curves import read_curves
 from repdib_lightning.evaluation.tables import KINDS
+from repdib_lightning.experiments.suite import explores
 from repdib_lightning.experiments.suite_measures import RECOGNITION_PARTS, RECOGNITION_SCORES
+
+REPLAY = "replay.h5"
+"""What an exploration records, in the run's folder."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +28,9 @@ class Facts:
 
     Attributes:
         configuration: config.yaml as a tree, and under ``finetune`` what each fine-tuning used.
-        versions, data: of environment.json; without pre-training the versions of the first fine-tuning, and no data.
+        versions, data: of environment.json; without pre-training the versions of the first fine-tuning, and no data. Of
+            an exploration the data are its replay.
+        probed: the store that an exploration was probed on, by file and fingerprint; empty for other runs.
         factors: name -> ``state`` or ``noise``.
         metrics: name -> number; see :func:`collect_measures`.
     """
@@ -33,6 +40,7 @@ class Facts:
     data: dict[str, str]
     factors: dict[str, str]
     metrics: dict[str, float]
+    probed: dict[str, str] = field(default_factory=dict)
 
 
 def collect_measures(run: Path, probe: Path | None, outcomes: Mapping[str, Path] | None = None) -> Facts:
@@ -56,8 +64,12 @@ def collect_measures(run: Path, probe: Path | None, outcomes: Mapping[str, Path]
       ``recognition/perplexity/MODALITY``, or ``.../fused``: of its codes
       (:mod:`repdib_lightning.evaluation.recognition`);
     - ``codes/used``, ``codes/perplexity``: means over the groups, on held-out episodes;
-    - ``val/...``: what the last validation logged;
+    - ``val/...``: what the last validation logged; ``explore/coverage``, ``.../coverage_share``: how far an
+      exploration got;
     - ``AGENT/NAME/...``: of each fine-tuning; what it says null of is left out.
+
+    What follows from several fine-tunings of a point is added when results are read
+    (:mod:`repdib_lightning.experiments.snapshot_measures`).
 
     Raises:
         UserError: a file is missing or is not what this package writes.
@@ -75,9 +87,18 @@ def _pretrained(run: Path, probe: Path) -> Facts:
         report = json.loads(probe.read_text())
         factors = {name: KINDS[content["kind"]] for name, content in report["factors"].items()}
         metrics = {**_trained(run), **_probed(report)}
-    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        explored = explores(configuration)
+        data = _replay(run, environment["data"]) if explored else environment["data"]
+        probed = {"file": report["data"], "fingerprint": report["fingerprint"]} if explored else {}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
         raise UserError(f"{run}: not a finished and probed run ({type(error).__name__}: {error})") from error
-    return Facts(configuration, environment["versions"], environment["data"], factors, metrics)
+    return Facts(configuration, environment["versions"], data, factors, metrics, probed)
+
+
+def _replay(run: Path, recorded: dict[str, str]) -> dict[str, str]:
+    """The replay as it is now: when environment.json was written it was still to be recorded."""
+    path = run / REPLAY
+    return {"file": REPLAY, "fingerprint": EpisodeStore(path).fingerprint} if path.is_file() else recorded
 
 
 def _with_outcome(facts: Facts, name: str, path: Path, run: Path) -> Facts:
@@ -105,7 +126,7 @@ def _without_folder(options: dict[str, Any], run: Path) -> dict[str, Any]:
 
 def _trained(run: Path) -> dict[str, float]:
     curves = read_curves(run / "metrics.csv")
-    wanted = [name for name in curves if name.startswith("val/") and "/group_" not in name]
+    wanted = [name for name in curves if name.startswith(("val/", "explore/coverage")) and "/group_" not in name]
     return {name: float(curves[name][-1, 1]) for name in wanted}
 
 

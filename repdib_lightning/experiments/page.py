@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from repdib_lightning.evaluation.report import Section, film, picture
@@ -50,12 +50,16 @@ def facts_of(results: Results) -> list[str]:
 
 def _stores(results: Results) -> str:
     """What the encoders were trained on; nothing where there are none."""
-    told = [
-        f"{record.data.get('file')} (fingerprint {record.data.get('fingerprint')})"
-        for record in results.records.values()
-        if record.data
-    ]
-    return ", on " + " and ".join(dict.fromkeys(told)) if told else ""
+    given = [record.data for record in results.records.values() if record.data and not record.probed]
+    probed = [record.probed for record in results.records.values() if record.probed]
+    told = f", on {_listed(given)}" if given else ""
+    return told + f", each exploration on a replay of its own and probed on {_listed(probed)}" if probed else told
+
+
+def _listed(stores: Sequence[Mapping[str, str]]) -> str:
+    """Every store once."""
+    told = [f"{store.get('file')} (fingerprint {store.get('fingerprint')})" for store in stores]
+    return " and ".join(dict.fromkeys(told))
 
 
 def as_markdown(title: str, facts: Sequence[str], parts: Sequence[Part]) -> str:

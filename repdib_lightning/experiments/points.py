@@ -15,7 +15,7 @@ from typing import IO, Any, Literal
 from repdib_lightning.callbacks.status_file import read_status
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.errors import UserError
-from repdib_lightning.experiments.suite import Setting, Suite
+from repdib_lightning.experiments.suite import SNAPSHOT, Setting, Suite
 
 OUTCOME = "outcome.json"
 """What a fine-tuning writes last, in its folder."""
@@ -38,7 +38,9 @@ class Record:
         error: one line, where the last attempt failed.
         job: of the cluster's queue, or empty.
         finished: whether every phase is done; only then are the following filled in.
-        configuration: everything that the run used. versions: of the packages. data: file and fingerprint.
+        configuration: everything that the run used. versions: of the packages.
+        data: file and fingerprint of what it was trained on; of an exploration its own replay.
+        probed: the same of the store that an exploration was probed on; empty for other points.
         threads: that each process had.
         factors: name -> ``state`` or ``noise``.
         metrics: measure -> number (see :mod:`repdib_lightning.experiments.measures`).
@@ -57,13 +59,14 @@ class Record:
     configuration: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     data: dict[str, str] = field(default_factory=dict)
+    probed: dict[str, str] = field(default_factory=dict)
     threads: int = 0
     factors: dict[str, str] = field(default_factory=dict)
     metrics: dict[str, float] = field(default_factory=dict)
 
     def line(self) -> str:
-        """The JSON line; without a word on fine-tunings where there are none."""
-        content = {name: value for name, value in asdict(self).items() if name != "finetune" or value}
+        """The JSON line; without a word on fine-tunings, or on another store for probing, where there are none."""
+        content = {name: value for name, value in asdict(self).items() if name not in ("finetune", "probed") or value}
         return json.dumps(content, allow_nan=False)
 
 
@@ -109,6 +112,12 @@ class Point:
     def finetune_folder(self, name: str) -> Path:
         """Of one fine-tuning."""
         return self.folder / "finetune" / name
+
+    def encoder_of(self, name: str) -> Path | None:
+        """What a fine-tuning is given: the exported bundle, the whole run for a snapshot of it, or nothing."""
+        if not self.setting.pretrained or self.setting.finetune is None:
+            return None
+        return self.folder if SNAPSHOT in self.setting.finetune.runs[name] else self.folder / "bundle"
 
     def unfinished_finetunings(self) -> list[str]:
         """Names of those that have not written their outcome."""

@@ -17,6 +17,7 @@ from repdib_lightning.experiments import figures, tables
 from repdib_lightning.experiments.comparison import Difference, Summary, differences, summaries
 from repdib_lightning.experiments.curve_names import check_curves
 from repdib_lightning.experiments.curves import Band, bands, finetune_bands, write_bands
+from repdib_lightning.experiments.exploration_part import exploration_parts
 from repdib_lightning.experiments.film_part import film_parts
 from repdib_lightning.experiments.finetune_parts import finetune_parts, training_only
 from repdib_lightning.experiments.group_part import group_parts
@@ -120,7 +121,8 @@ def _grid_parts(
             "↑ more is better, ↓ less is better. P: probability that a run is better than one of the baseline."
         )
         parts.append(Part(f"Grid: {grid.name}", sentences, shown, drawn))
-        parts += finetune_parts(grid, all_bands[grid.name], all_maps[grid.name])
+        explored = exploration_parts(results, grid, all_bands[grid.name])
+        parts += explored or finetune_parts(grid, all_bands[grid.name], all_maps[grid.name])
     return parts
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from repdib_lightning.errors import UserError
 from repdib_lightning.experiments.points import Point, Record, points_of
+from repdib_lightning.experiments.snapshot_measures import snapshot_measures
 from repdib_lightning.experiments.suite import Grid, Setting, Suite
 
 
@@ -62,7 +63,7 @@ class Results:
 
 
 def load_results(suite: Suite, seeds: Iterable[int], runs: Path) -> Results:
-    """Read every finished point of a suite.
+    """Read every finished point of a suite; what its snapshots show is added to the measures of its record.
 
     Raises:
         UserError: none is finished, a record is damaged, or two runs are of different data.
@@ -72,6 +73,7 @@ def load_results(suite: Suite, seeds: Iterable[int], runs: Path) -> Results:
     for point in points_of(suite, wanted, runs):
         record = point.record()
         if record.finished:
+            record.metrics |= snapshot_measures(record.metrics, point.setting.finetune)
             points[point.setting.place, point.seed] = point
             records[point.setting.place, point.seed] = record
         else:
@@ -85,16 +87,21 @@ def load_results(suite: Suite, seeds: Iterable[int], runs: Path) -> Results:
 
 
 def _check_same_data(points: dict[tuple[str, int], Point], records: dict[tuple[str, int], Record]) -> None:
-    """A store is the same for all that were trained on it; without pre-training there is none."""
+    """A store is the same for all that were trained, or after exploring probed, on it; from scratch there is none."""
     firsts: dict[Path, tuple[str, int]] = {}
     for other, record in records.items():
         store = points[other].setting.data
         if store is None:
             continue
         key = firsts.setdefault(store, other)
-        first = records[key]
-        if record.data.get("fingerprint") != first.data.get("fingerprint"):
+        if _data_of(record).get("fingerprint") != _data_of(records[key]).get("fingerprint"):
+            done = "probed" if record.probed else "trained"
             raise UserError(
-                f"{points[other].folder}: was trained on other data than {points[key].folder} (fingerprints differ); "
+                f"{points[other].folder}: was {done} on other data than {points[key].folder} (fingerprints differ); "
                 "remove one of them and run the suite again"
             )
+
+
+def _data_of(record: Record) -> dict[str, str]:
+    """The store that the suite names."""
+    return record.probed or record.data

@@ -151,7 +151,8 @@ def check_finetunings(plan: Suite, points: Sequence[Point]) -> None:
     checked = set()
     for point in points:
         for name, arguments in point.finetune.items():
-            encoder = ["--encoder", str(point.folder / "bundle")] if point.setting.pretrained else []
+            given = point.encoder_of(name)
+            encoder = [] if given is None else ["--encoder", str(given)]
             different = (*arguments[: arguments.index("--seed")], bool(encoder))
             if different in checked:
                 continue

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,12 @@ CONFIG = "config"
 SET_BY_SUITE = ("seed_everything", "data.seed", "data.init_args.seed", "data.path", "data.init_args.path", "run")
 """Options of ``fit`` that follow from the suite's data and seeds, so that no setting may give them."""
 
+EXPLORATION = "ExplorationDataModule"
+"""The data class whose ``fit`` explores: it makes its data itself. Written out, since it imports torch."""
+
+SNAPSHOT, SNAPSHOTS = "snapshot", "snapshots"
+"""Option of ``finetune``; key of a suite's fine-tuning and of an exploration's data."""
+
 PROBE_OPTIONS = ("probes", "groups", "clusters", "device", "seed")
 
 PHASES = ("fit", "export", "probe", "finetune")
@@ -34,11 +40,14 @@ class Finetune:
 
     Attributes:
         agent: as ``finetune AGENT`` takes it.
-        runs: name -> options of ``finetune``, ``env`` among them; the name is a folder and part of the measures'.
+        runs: name -> options of ``finetune``, its environment or task among them; the name is a folder and part of the
+            measures'.
+        snapshots: name in the file -> frames of an exploration -> which of the runs begins there; empty without.
     """
 
     agent: str
     runs: Mapping[str, Mapping[str, Any]]
+    snapshots: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
 
     def arguments(self, name: str, seed: int) -> list[str]:
         """What ``finetune`` is given for one of the runs, but for the encoder and the run's folder."""
@@ -53,6 +62,16 @@ class Finetune:
         }
         return replace(self, runs=runs)
 
+    def from_snapshots(self, frames: Sequence[int]) -> Finetune:
+        """Every run from each snapshot of an exploration, as NAME_FRAMES; the same without any."""
+        if not frames:
+            return self
+        snapshots = {name: {count: f"{name}_{count}" for count in sorted(frames)} for name in self.runs}
+        runs = {
+            run: {**self.runs[name], SNAPSHOT: count} for name, by in snapshots.items() for count, run in by.items()
+        }
+        return replace(self, runs=runs, snapshots=snapshots)
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -63,7 +82,7 @@ class Setting:
         configs: configurations as ``fit --config`` takes them, later ones over earlier ones.
         options: dotted key -> value, over all of them.
         merged: what these files and options say together.
-        data: the store that it is trained and probed on; None without pre-training.
+        data: the store that it is trained and probed on, or only probed on if it explores; None without pre-training.
         pretrained: whether there is an encoder to train, export and probe; else fine-tuning begins from scratch.
         finetune: what follows; None for nothing.
     """
@@ -81,6 +100,11 @@ class Setting:
     def place(self) -> str:
         """``grid/name``."""
         return f"{self.grid}/{self.name}"
+
+    @property
+    def explores(self) -> bool:
+        """Whether ``fit`` acts in an environment and records what it learns from, instead of reading a store."""
+        return explores(self.merged)
 
     @property
     def phases(self) -> tuple[str, ...]:
@@ -104,7 +128,7 @@ class Grid:
     Attributes:
         name: of the table that it becomes. about: a line above that table.
         settings: in the order of the file; ``baseline`` is the name of the one that the others are compared with.
-        data: the store that its settings are trained and probed on.
+        data: the store that its settings are trained and probed on, or only probed on if they explore.
         collect: words of a ``collect`` command that makes the store where it is absent; empty for none.
         seeds: of the suite's reported seeds, those that its settings are run with; empty for all.
         probe: options of ``probe`` in place of the suite's; None for those.
@@ -244,6 +268,13 @@ class Suite:
     def run_by(self, setting: Setting) -> Setting:
         """The setting whose runs this one shares (mostly itself)."""
         return self._first[identity(setting)]
+
+
+def explores(merged: Mapping[str, Any]) -> bool:
+    """Whether a configuration's data are made by exploring."""
+    data = merged.get("data")
+    named = data.get("class_path") if isinstance(data, Mapping) else data
+    return str(named).rpartition(".")[2] == EXPLORATION
 
 
 def identity(setting: Setting) -> str:

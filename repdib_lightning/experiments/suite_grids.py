@@ -16,15 +16,30 @@ import yaml
 from repdib_lightning import configurations
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.experiments.merging import merged, with_option
-from repdib_lightning.experiments.suite import CONFIG, PROBE_OPTIONS, SET_BY_SUITE, Finetune, Grid, Setting, check_seeds
+from repdib_lightning.experiments.snapshots import check_names, check_snapshots, read_snapshots
+from repdib_lightning.experiments.suite import (
+    CONFIG,
+    PROBE_OPTIONS,
+    SET_BY_SUITE,
+    SNAPSHOT,
+    SNAPSHOTS,
+    Finetune,
+    Grid,
+    Setting,
+    check_seeds,
+    explores,
+)
 from repdib_lightning.experiments.suite_checks import check_choice, check_keys, check_name, listed, mapping
 from repdib_lightning.rl import AGENTS
 
 PRETRAINED = "pretrained"
 """Key of a setting: false for one without pre-training."""
 
-SET_FOR_FINETUNE = ("seed", "encoder", "run", "overwrite", "data")
-"""Options of ``finetune`` that follow from the point."""
+SET_FOR_FINETUNE = ("seed", "encoder", "run", "overwrite", "data", SNAPSHOT)
+"""Options of ``finetune`` that follow from the point, or from the suite's list of snapshots."""
+
+PLACES = ("task", "env")
+"""Options of ``finetune`` that say where an agent acts; one of them is needed."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +63,8 @@ def read_grid(file: Path, name: str, content: Any, common: Common) -> Grid:
     known = {"about", "baseline", "with", "vary", "settings", "data", "collect", "finetune", "seeds", "probe"}
     check_keys(file, key, content, known)
     own = _own(file, key, content, common)
-    finetune = read_finetune(file, f"{key}.finetune" if content.get("finetune") else "finetune", own.finetune)
+    named = f"{key}.finetune" if content.get("finetune") else "finetune"
+    finetune = read_finetune(file, named, own.finetune)
     if finetune is not None and learns_from_data(finetune.agent):
         told = {run: {"data": str(own.data), **options} for run, options in finetune.runs.items()}
         finetune = replace(finetune, runs=told)
@@ -113,7 +129,8 @@ def read_config(file: Path, key: str, name: Any) -> str:
 
 def read_finetune(file: Path, key: str, content: Mapping[str, Any]) -> Finetune | None:
     """Fine-tunings as a file says them; None where there are none."""
-    check_keys(file, key, dict(content), {"agent", "with", "runs"})
+    check_keys(file, key, dict(content), {"agent", "with", "runs", SNAPSHOTS})
+    snapshots = read_snapshots(file, f"{key}.{SNAPSHOTS}", content.get(SNAPSHOTS))
     shared = mapping(file, f"{key}.with", content.get("with"))
     given = mapping(file, f"{key}.runs", content.get("runs"))
     if not given:
@@ -122,7 +139,10 @@ def read_finetune(file: Path, key: str, content: Mapping[str, Any]) -> Finetune 
         raise UserError(f"{file}: {key}.agent must name an agent, such as dqn, is {content.get('agent')!r:.60}")
     agent = content["agent"]
     check_choice(file, f"{key}.agent", agent, list(AGENTS))
+    if snapshots and SNAPSHOT not in _parameters(agent):
+        raise UserError(f"{file}: {key}.{SNAPSHOTS}: '{agent}' takes no snapshots of an exploration; leave them out")
     known = _options_of(agent)
+    place = next((option for option in PLACES if option in known), "")
     _check_finetune_options(file, f"{key}.with", shared, known)
     runs: dict[str, dict[str, Any]] = {}
     for name, own in given.items():
@@ -130,8 +150,10 @@ def read_finetune(file: Path, key: str, content: Mapping[str, Any]) -> Finetune 
         options = mapping(file, f"{key}.runs.{name}", own)
         _check_finetune_options(file, f"{key}.runs.{name}", options, known)
         runs[name] = {**shared, **options}
-        if not learns_from_data(agent) and not isinstance(runs[name].get("env"), str):
-            raise UserError(f"{file}: {key}.runs.{name}.env must name an environment, such as SpiralWorld")
+        if place and not learns_from_data(agent) and not isinstance(runs[name].get(place), str):
+            such = {"env": "an environment, such as SpiralWorld", "task": "a task, such as walker-run"}[place]
+            raise UserError(f"{file}: {key}.runs.{name}.{place} must name {such}")
+    check_names(file, f"{key}.runs", list(runs), snapshots)
     return Finetune(agent, runs)
 
 
@@ -182,9 +204,14 @@ def _setting(file: Path, key: str, bare: Setting, parts: Sequence[Mapping[str, A
     given = {option: value for option, value in given.items() if option != PRETRAINED}
     configs = [*own.base, *(read_config(file, key, c) for part in (fixed, given) for c in listed(part.get(CONFIG, [])))]
     options = {k: v for part in (fixed, given) for k, v in part.items() if k != CONFIG}
-    options = {"data.path": str(own.data), **options}
+    if not explores(_together(configs, options)):  # which makes its data itself
+        options = {"data.path": str(own.data), **options}
     together = _together(configs, options)
     finetune = None if bare.finetune is None else bare.finetune.of_an_encoder()
+    if finetune is not None:
+        frames = read_snapshots(file, f"{key}.finetune.{SNAPSHOTS}", own.finetune.get(SNAPSHOTS))
+        check_snapshots(file, f"{key}.finetune.{SNAPSHOTS}", frames, bare.place, together)
+        finetune = finetune.from_snapshots(frames)
     return replace(bare, configs=tuple(configs), options=options, merged=together, data=own.data, finetune=finetune)
 
 
@@ -247,6 +274,8 @@ def _check_finetune_options(file: Path, key: str, options: Mapping[Any, Any], kn
     for option in options:
         if not isinstance(option, str):
             raise UserError(f"{file}: {key}: {option!r} is no option of finetune, such as steps")
+        if option == SNAPSHOT:
+            raise UserError(f"{file}: {key}: '{option}' is one of several; list them as {SNAPSHOTS} beside 'runs'")
         if option in SET_FOR_FINETUNE:
             raise UserError(f"{file}: {key}: '{option}' follows from the suite's seeds and runs; leave it out")
         check_choice(file, key, option.partition(".")[0], known)

@@ -7,6 +7,7 @@ from typing import Any
 
 from repdib_lightning.errors import UserError, nearest
 from repdib_lightning.experiments.merging import REPLACED
+from repdib_lightning.experiments.snapshots import ALL, MONOTONE
 from repdib_lightning.experiments.suite import Grid, HeadlineRow, Suite
 from repdib_lightning.word_lists import words
 
@@ -133,12 +134,16 @@ def _check(suite: Suite, key: str, measure: str, grids: Sequence[Grid]) -> None:
     finetunes = [setting.finetune for setting in settings if setting.finetune is not None]
     probes = [name for grid in grids for name in probes_of(suite, grid)]
     probed = (*probes, "codes", "val") if any(setting.pretrained for setting in settings) else ()
-    known = {*probed, *(finetune.agent for finetune in finetunes)}
+    explored = ("explore",) if any(setting.explores for setting in settings) else ()
+    known = {*probed, *explored, *(finetune.agent for finetune in finetunes)}
     where = f"{suite.file}: {key}: '{measure}'"
     if first not in known:
         raise UserError(f"{where}: '{first}' is no probe or agent here, {nearest(first, known)}")
-    runs = {name for finetune in finetunes if finetune.agent == first for name in finetune.runs}
+    of_agent = [finetune for finetune in finetunes if finetune.agent == first]
+    runs = {name for finetune in of_agent for name in (*finetune.runs, *finetune.snapshots)}
     name, _, of_run = rest.partition("/")
+    if (name, of_run) == (ALL, MONOTONE) and any(finetune.snapshots for finetune in of_agent):
+        return
     if runs and name not in runs:
         raise UserError(f"{where}: no fine-tuning is called '{name}', {nearest(name, runs)}")
     if runs and not of_run:

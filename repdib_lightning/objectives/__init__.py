@@ -8,6 +8,7 @@ from repdib_lightning.objectives.emi import EMI
 from repdib_lightning.objectives.forward_prediction import ForwardPrediction
 from repdib_lightning.objectives.info_nce import InfoNCE
 from repdib_lightning.objectives.inverse_dynamics import InverseDynamics
+from repdib_lightning.objectives.prototypes import Prototypes
 from repdib_lightning.objectives.reconstruction import Reconstruction
 from repdib_lightning.objectives.several import SeveralObjectives
 
@@ -20,6 +21,7 @@ OBJECTIVES: dict[str, type[Objective]] = {
         ForwardPrediction,
         EMI,
         DynamicBottleneck,
+        Prototypes,
         Reconstruction,
         Classification,
         SeveralObjectives,
@@ -38,6 +40,7 @@ __all__ = [
     "InfoNCE",
     "InverseDynamics",
     "Objective",
+    "Prototypes",
     "Reconstruction",
     "SeveralObjectives",
 ]

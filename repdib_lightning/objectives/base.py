@@ -21,9 +21,15 @@ class Objective(nn.Module):
     """Turns a batch into named losses. Subclasses are built as ``Objective(width, spec, *, ...)``.
 
     Class attributes say what the data must offer; the data module draws the samples accordingly.
+
+    Attributes:
+        needs_actions: whether actions are fed to it.
+        target_rate: above 0, it is given a third argument, ``target``, an :data:`Encode` without gradient: encoder and
+            bottleneck as running averages that follow at this rate after each optimiser step.
     """
 
     needs_actions: bool = False
+    target_rate: float = 0.0
 
     @property
     def label(self) -> str:
@@ -45,6 +51,9 @@ class Objective(nn.Module):
         built anew for every evaluation, and sum up the processes themselves.
         """
         return {}
+
+    def follow(self) -> None:
+        """Go a step with a target head of its own, where it has one. Called as often as the target network follows."""
 
     def forward(self, batch: Batch, encode: Encode) -> ObjectiveOutput:
         """Encode what is needed with one call of ``encode``, and return unweighted losses."""

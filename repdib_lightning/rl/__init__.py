@@ -4,14 +4,18 @@ from __future__ import annotations
 
 AGENTS = {
     "bc": "repdib_lightning.rl.finetune_offline:finetune_bc",
+    "ddpg": "repdib_lightning.rl.finetune_online:finetune_ddpg",
     "dqn": "repdib_lightning.rl.finetune_dqn:finetune_dqn",
+    "sac": "repdib_lightning.rl.finetune_online:finetune_sac",
     "td3bc": "repdib_lightning.rl.finetune_offline:finetune_td3bc",
 }
 """Agent -> ``module:function`` behind ``finetune AGENT``."""
 
 CHECKS = {
     "bc": "repdib_lightning.rl.finetune_offline:check_bc",
+    "ddpg": "repdib_lightning.rl.finetune_online:check_ddpg",
     "dqn": "repdib_lightning.rl.finetune_dqn:check_dqn",
+    "sac": "repdib_lightning.rl.finetune_online:check_sac",
     "td3bc": "repdib_lightning.rl.finetune_offline:check_td3bc",
 }
 """Agent -> ``module:function`` that takes the same options and raises UserError for what is wrong with them, as far as

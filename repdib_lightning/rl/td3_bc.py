@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from repdib_lightning.rl.actor_critic import adam, critic_loss, descend, follow, noisy, smaller_value
 from repdib_lightning.rl.networks import Actor, TwinCritic
 from repdib_lightning.rl.transitions import Seen, TransitionBatch
 
@@ -37,16 +38,13 @@ class BehaviourCloning(pl.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Adam over actor and features."""
-        return self._adam([*self.features.parameters(), *self.actor.parameters()])
+        return adam([*self.features.parameters(), *self.actor.parameters()], self.learning_rate)
 
     def training_step(self, batch: TransitionBatch, number: int) -> None:
         """One update."""
         loss = F.mse_loss(self.act(batch.seen), batch.actions)
-        _descend(self.optimizers(use_pl_optimizer=False), loss)
+        descend(loss, self.optimizers(use_pl_optimizer=False))
         self.latest = {"clone": loss.detach()}
-
-    def _adam(self, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
-        return torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)
 
 
 class TD3BC(BehaviourCloning):
@@ -87,8 +85,8 @@ class TD3BC(BehaviourCloning):
 
     def configure_optimizers(self) -> Any:
         """One Adam for critic and features, one for the actor."""
-        critic = self._adam([*self.features.parameters(), *self.critic.parameters()])
-        return [critic, self._adam(list(self.actor.parameters()))]
+        critic = adam([*self.features.parameters(), *self.critic.parameters()], self.learning_rate)
+        return [critic, adam(self.actor.parameters(), self.learning_rate)]
 
     def training_step(self, batch: TransitionBatch, number: int) -> None:
         """One update of the critic, one of the actor, one of the target."""
@@ -96,10 +94,10 @@ class TD3BC(BehaviourCloning):
         of_critic, of_actor = optimizers
         seen = self.features(batch.seen)
         loss, value = self.critic_loss(seen, batch)
-        _descend(of_critic, loss)
+        descend(loss, of_critic)
         seen = seen.detach()
         of_values, cloning = self.actor_losses(seen, batch.actions)
-        _descend(of_actor, of_values + cloning)
+        descend(of_values + cloning, of_actor)
         self.follow()
         self.latest = {"critic": loss.detach(), "clone": cloning.detach(), "value": value}
 
@@ -108,34 +106,19 @@ class TD3BC(BehaviourCloning):
         with torch.no_grad():
             later = self.features(batch.later)
             values = self.target(later, self.noisy(self.actor(later))).amin(0)
-            wanted = batch.returns + batch.discounts * values
-        both = self.critic(seen, batch.actions)
-        return (both - wanted).square().mean(1).sum(), both.detach().mean()
+        return critic_loss(self.critic, seen, batch.actions, batch.returns, batch.discounts, values)
 
     def actor_losses(self, seen: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """What the critics and what the data ask of the actor, on features (B, M): two scalars."""
         acted = self.noisy(self.actor(seen))
-        self.critic.requires_grad_(False)
-        values = self.critic(seen, acted).amin(0)
-        self.critic.requires_grad_(True)
+        values = smaller_value(self.critic, seen, acted)
         weight = self.alpha / values.detach().abs().mean().clamp_min(1e-6)
         return -weight * values.mean(), F.mse_loss(acted, actions)
 
     def noisy(self, actions: Tensor) -> Tensor:
         """Add clipped noise; the result stays in [-1, 1], with the gradient of the actions."""
-        noise = (self.noise * torch.randn_like(actions)).clamp(-self.noise_clip, self.noise_clip)
-        moved = actions + noise
-        return moved.detach().clamp(-1.0, 1.0) + (moved - moved.detach())
+        return noisy(actions, self.noise, self.noise_clip)
 
-    @torch.no_grad()
     def follow(self) -> None:
         """Move the target critic by tau."""
-        pairs = zip(self.target.parameters(), self.critic.parameters(), strict=True)
-        targets, sources = zip(*pairs, strict=True)
-        torch._foreach_lerp_(list(targets), list(sources), self.tau)
-
-
-def _descend(optimizer: Any, loss: Tensor) -> None:
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward()
-    optimizer.step()
+        follow(self.target, self.critic, self.tau)

@@ -9,13 +9,15 @@ and ``end ...`` where it is fit. A file ``orders/PHASE-POINT`` (POINT is SETTING
 - ``die at the end``: SIGKILL after the last step's checkpoint, before the status says so;
 - ``nan``: training logs a loss that is none.
 
-For finetune, ``fail NAME`` and ``wait NAME`` are about one of a point's fine-tunings.
+For finetune, ``fail NAME`` and ``wait NAME`` are about one of a point's fine-tunings. A fit with ``--data.snapshots``
+explores: small.h5 becomes its replay.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -104,6 +106,8 @@ def fit(words: list[str]) -> None:
         facts = {"versions": {"python": "3"}, "data": {"file": "small.h5", "fingerprint": "f"}}
         (run / "environment.json").write_text(json.dumps(facts))
         (run / "metrics.csv").write_text(f"step,val/loss\n1,9.0\n3,{loss}\n")
+        if "--data.snapshots" in words:
+            explore(run, json.loads(words[words.index("--data.snapshots") + 1]))
     if ordered("fit", run) == "wait before checkpoint":
         wait(run)
     checkpoint.write_text(f"new {time.time_ns()}" if not resumed else checkpoint.read_text())
@@ -114,6 +118,18 @@ def fit(words: list[str]) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
     write_status(run, "finished")
     note("end fit", f"{run.parent.name}-{run.name}")
+
+
+def explore(run: Path, snapshots: list[int]) -> None:
+    with open(run / "config.yaml", "a") as file:
+        file.write("data:\n  class_path: repdib_lightning.rl.exploration.data.ExplorationDataModule\n")
+    facts = {"versions": {"python": "3"}, "data": {"file": "replay.h5", "fingerprint": ""}}
+    (run / "environment.json").write_text(json.dumps(facts))
+    rows = ["step,explore/coverage,explore/loss,val/loss", "1,40,,", "2,,0.5,", "3,60,,0.25"]
+    (run / "metrics.csv").write_text("\n".join(rows) + "\n")
+    shutil.copy("small.h5", run / "replay.h5")
+    for frames in snapshots:
+        (run / "snapshots" / f"frames-{frames:09d}").mkdir(parents=True)
 
 
 def wait(run: Path, phase: str = "fit") -> None:
@@ -147,16 +163,20 @@ def probe(words: list[str]) -> None:
     kept = 0.5 + int(run.name[-1]) / 10
     score = {"linear": {"kept": kept, "score": kept}}
     report = {"factors": {"cell": {"kind": "endogenous", "probes": score}}, "codebook": None, "pictures": None,
+              "data": Path(words[1]).name, "fingerprint": "probed",
               "summary": {"endogenous": {"linear": kept}, "exogenous": {"linear": None}}}  # fmt: skip
     output.write_text(json.dumps(report))
 
 
 def finetune(words: list[str]) -> None:
     given = dict(zip(words[1::2], words[2::2], strict=True))
-    folder, environment = Path(given["--run"]), given["--env"]
+    folder, environment = Path(given["--run"]), given["--env" if "--env" in given else "--task"]
     run, name = folder.parent.parent, folder.name
-    encoder = given.get("--encoder", "")
-    assert not encoder or Path(encoder, "config.json").is_file(), encoder
+    encoder, snapshot = given.get("--encoder", ""), given.get("--snapshot", "")
+    if snapshot:
+        assert Path(encoder, "snapshots", f"frames-{int(snapshot):09d}").is_dir(), encoder
+    else:
+        assert not encoder or Path(encoder, "config.json").is_file(), encoder
     note("begin finetune", f"{run.parent.name}-{run.name}", name, encoder or "scratch")
     folder.mkdir(parents=True)  # as finetune does, it does not go on with one that was ended
     (folder / "progress.csv").write_text("step,eval/success\n100,0.0\n200,1.0\n")
@@ -166,6 +186,8 @@ def finetune(words: list[str]) -> None:
     if told == f"wait {name}":
         wait(run, "finetune")
     measures = {"success": 0.5 + int(given["--seed"]) / 10, "steps_to_solve": None}
+    if words[0] == "ddpg":
+        measures = {"return": int(snapshot or 0) / 10 + int(given["--seed"]), "mean_return": 1.0}
     outcome = {"agent": words[0], "environment": environment, "versions": {"python": "3"}, "configuration": given,
                "measures": measures, "maps": {}}  # fmt: skip
     (folder / "outcome.json").write_text(json.dumps(outcome))

@@ -16,6 +16,7 @@ from fake_phases import calls, wait_until
 from test_suite_runs import LAUNCH
 
 from repdib_lightning.__main__ import main
+from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.experiments import run as suite_run
 
 SUITE = """
@@ -228,3 +229,86 @@ def test_each_grid_trains_and_probes_on_its_own_data(here, store_file):
     for grid, store in (("noisy", "noisy.h5"), ("g", "small.h5")):
         log = Path(f"runs/suites/m/{grid}/none/seed_0.log").read_text()
         assert f"--data.path {store}" in log and f"probe runs/suites/m/{grid}/none/seed_0 {store}" in log
+
+
+# explorations, and their snapshots
+
+EXPLORE = """
+data: {class_path: ExplorationDataModule, init_args: {task: walker-stand, frames: 40000}}
+model: {bottleneck: {class_path: Identity}}
+"""
+EXPLORING = """
+base: explore.yaml
+data: small.h5
+seeds: [0, 1]
+finetune:
+  agent: ddpg
+  with: {frames: 20000, features: 64}
+  snapshots: [5000, 10000]
+  runs:
+    walk: {task: walker-walk}
+grids:
+  g:
+    with: {data.snapshots: [5000, 10000, 20000]}
+    settings:
+      none: {}
+      scratch: {pretrained: false}
+"""
+
+
+@pytest.fixture
+def exploring(here):
+    Path("explore.yaml").write_text(EXPLORE)
+    Path("m.yaml").write_text(EXPLORING)
+    return here
+
+
+def test_an_exploration_is_fine_tuned_from_each_snapshot_and_has_data_of_its_own(exploring, capsys):
+    assert run("--only", "none", "--seeds", "1") == 0
+    assert begun() == ["fit", "export", "probe", "finetune walk_5000", "finetune walk_10000"]
+    assert {line[4] for line in calls("begin", "finetune")} == {str(folder("none", 1))}, "the run, which has snapshots"
+    found = record("none", 1)
+    assert "--data.path" not in found["arguments"] and found["arguments"][-2:] == ["--data.seed", "1"]
+    assert found["metrics"]["ddpg/walk_5000/return"] == 501.0 and found["metrics"]["ddpg/walk_10000/return"] == 1001.0
+    assert found["metrics"]["explore/coverage"] == 60.0 and "explore/loss" not in found["metrics"]
+    replay = EpisodeStore(folder("none", 1) / "replay.h5")
+    assert found["data"] == {"file": "replay.h5", "fingerprint": replay.fingerprint} and replay.fingerprint
+    assert found["probed"] == {"file": "small.h5", "fingerprint": "probed"}
+    used = found["configuration"]["finetune"]["walk_5000"]
+    assert used["--snapshot"] == "5000" and "--features" not in used
+    assert state(capsys, "none") == "waiting" and record("none", 1)["finished"]
+
+
+def test_from_scratch_there_are_no_snapshots(exploring):
+    assert run("--only", "scratch", "--seeds", "0") == 0
+    assert begun() == ["finetune walk"] and calls("begin")[0][4] == "scratch"
+    assert record("scratch")["configuration"]["finetune"]["walk"]["--features"] == "64"
+    assert record("scratch")["metrics"]["ddpg/walk/return"] == 0.0 and "probed" not in record("scratch")
+
+
+def test_a_snapshot_that_is_added_later_is_the_only_one_that_is_fine_tuned_from(exploring, capsys):
+    assert run("--only", "none", "--seeds", "0") == 0
+    Path("m.yaml").write_text(EXPLORING.replace("[5000, 10000]\n", "[5000, 10000, 20000]\n"))
+    before = len(calls("begin"))
+    assert state(capsys, "none") == "stopped finetune walk_20000"
+    assert run("--only", "none", "--seeds", "0") == 0
+    assert begun(before) == ["finetune walk_20000"]
+
+
+def test_the_report_of_explorations_holds_the_snapshots_against_each_other_and_scratch(exploring, capsys):
+    assert run() == 0
+    for setting, name in (("none", "walk_5000"), ("none", "walk_10000"), ("scratch", "walk")):
+        for seed in (0, 1):
+            path = folder(setting, seed) / "finetune" / name / "progress.csv"
+            path.write_text("step,eval/return\n0,1\n20000,2\n")
+    for path in Path("runs").rglob("probe.json"):
+        assert json.loads(path.read_text())["codebook"] is None
+    capsys.readouterr()
+    Path("m.yaml").write_text(f"{EXPLORING}finetune_curves: [eval/return]\nmeasures: [ddpg/walk/monotone]\n")
+    assert main(["suite", "report", "m.yaml"]) == 0
+    said = Path("results/m/report.md").read_text()
+    assert "each exploration on a replay of its own and probed on small.h5 (fingerprint probed)" in said
+    assert "| walk: return at the end, after 10,000 frames | 1000.5 [1000.0, 1001.0] | - |" in said
+    assert "| walk: return at the end, from scratch | - | 0.5 [0.0, 1.0] |" in said
+    assert "| walk: rank correlation | 1.00 [1.00, 1.00] | - |" in said
+    assert Path("results/m/g-snapshots-walk-eval-return.png").is_file()

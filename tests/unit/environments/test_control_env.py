@@ -194,6 +194,44 @@ def test_environments_that_are_open_at_once_show_their_own_pictures():
         env.close()
 
 
+@pytest.mark.parametrize("frames", [2, 3])
+def test_frames_are_stacked_the_oldest_first(frames):
+    """The first one is repeated when an episode begins, and nothing is left of the episode before."""
+    env, single = make(frame_stack=frames, distractors="video", render_mode="rgb_array"), make(distractors="video")
+    for seed in (1, None):
+        stacked, plain = played(env, seed), played(single, seed)
+        for step, (observation, reward, factors) in enumerate(stacked):
+            expected = [plain[max(0, step - back)][0] for back in range(frames - 1, -1, -1)]
+            assert np.array_equal(observation, np.concatenate(expected)) and reward == plain[step][1]
+            assert all(np.array_equal(factors[name], plain[step][2][name]) for name in factors)
+        assert env.observation_space.contains(stacked[-1][0]) and stacked[-1][0].shape[0] == 3 * frames
+        assert np.array_equal(env.render(), plain[-1][0].transpose(1, 2, 0)), "the newest one is rendered"
+    env.close()
+    single.close()
+
+
+def test_stacked_observations_are_not_written_over():
+    env = make(frame_stack=2)
+    first, *_ = env.reset(seed=0)
+    kept = first.copy()
+    played(env, None)
+    assert np.array_equal(first, kept)
+    env.close()
+
+
+def test_the_task_that_an_id_decides_is_not_given_twice():
+    with pytest.raises(
+        UserError, match=r"task=cheetah-run: the task is walker-run; leave it out, or take repdib/Contr"
+    ):
+        make(task="cheetah-run", world="walker-run")
+    env = make(world="cheetah-run")
+    assert env.task.name == "cheetah-run"
+    env.close()
+    env = make()
+    assert env.task.name == "walker-walk"
+    env.close()
+
+
 def test_render_shows_the_observation():
     env = make(render_mode="rgb_array", distractors="video")
     observation = played(env, 0)[-1][0]
@@ -214,6 +252,8 @@ def test_render_shows_the_observation():
         ({"distractors": "video", "source": "proceduraal"}, r"'proceduraal' is neither built in nor a folder, did you"),
         ({"task": "humanoid-walk", "distractors": "image"}, r"place=sky: nothing of the sky is seen in humanoid-walk"),
         ({"action_repeat": 0}, r"action_repeat=0: must be at least 1"),
+        ({"frame_stack": 0}, r"frame_stack=0: must be at least 1"),
+        ({"task": ""}, r"task : unknown, choices: "),
         ({"render_mode": "human"}, r"render_mode=human: must be rgb_array or None"),
     ],
 )

@@ -79,6 +79,7 @@ def test_a_record_is_one_line_of_json_and_comes_back_whole(point):
     assert text.endswith("}\n") and text.count("\n") == 1
     content = asdict(record)
     assert content.pop("finetune") == {}, "without fine-tunings there is no word on them"
+    assert content.pop("probed") == {}, "it was probed on what it was trained on"
     assert json.loads(text) == content
     assert point.record() == record
     assert [path.name for path in point.folder.parent.iterdir()] == ["seed_0.json"]
