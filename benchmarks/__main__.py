@@ -26,6 +26,8 @@ COMMANDS = {
     "mazes": ["mazes"],
     "offline_agents": ["offline_agents"],
     "offline_run": ["offline_run"],
+    "exploration": ["exploration"],
+    "replay": ["replay"],
 }
 ON = {
     "cpu": [
@@ -37,6 +39,8 @@ ON = {
         "start",
         "mazes",
         "offline_agents",
+        "exploration",
+        "replay",
     ],
     "cuda": ["quantiser", "data_path", "training_step", "encoding", "offline_run"],
 }

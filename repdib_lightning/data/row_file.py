@@ -6,6 +6,7 @@ places, so that the file is readable whenever the process is killed, and a faile
 
 from __future__ import annotations
 
+import fcntl
 import mmap
 import os
 from collections.abc import Sequence
@@ -146,5 +147,6 @@ class RowFile:
             assert file.attrs["fingerprint"] == fingerprint
 
     def close(self) -> None:
-        """Give the file and its lock back."""
+        """Give the file and its lock back, even where the file is still mapped, which keeps it open."""
+        fcntl.flock(self._handle, fcntl.LOCK_UN)
         os.close(self._handle)

@@ -18,7 +18,7 @@ Direction = Literal["up", "down", ""]
 
 _REACHED = (
     *("return", "success", "solved", "coverage", "entropy", "topology", "topology_pairs"),
-    *("mean_return", "mean_success", "final_success", "mean_coverage", MONOTONE),
+    *("mean_return", "first_return", "best_return", "mean_success", "final_success", "mean_coverage", MONOTONE),
 )
 _NEEDED = ("steps_to_solve", "moves")
 _NEITHER_OF_RECOGNITION = ("weight", "perplexity")

@@ -13,6 +13,7 @@ from repdib_lightning.experiments.snapshots import ALL, MONOTONE
 from repdib_lightning.experiments.suite import Finetune
 
 _RANKED = "return"
+_DIGITS = 10  # a perfect order is 1, not 0.9999999999999999
 
 
 def snapshot_measures(metrics: Mapping[str, float], finetune: Finetune | None) -> dict[str, float]:
@@ -55,4 +56,4 @@ def rank_correlation(returns: Mapping[int, float | None]) -> float | None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", stats.ConstantInputWarning)
         value = float(stats.spearmanr(list(returns), known).statistic)
-    return value if math.isfinite(value) else None
+    return round(value, _DIGITS) if math.isfinite(value) else None

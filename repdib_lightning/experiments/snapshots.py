@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from repdib_lightning.errors import UserError, nearest
+from repdib_lightning.errors import UserError
 from repdib_lightning.experiments.suite import EXPLORATION, SNAPSHOTS, explores
 
 ALL, MONOTONE = "all", "monotone"
@@ -60,5 +60,5 @@ def check_snapshots(file: Path, key: str, frames: Sequence[int], place: str, mer
         raise UserError(f"{file}: {key}: '{place}' does not say which it writes; add data.{SNAPSHOTS}: {list(frames)}")
     for count in frames:
         if count not in written:
-            choices = [str(known) for known in written]
-            raise UserError(f"{file}: {key}: '{place}' writes no snapshot {count}, {nearest(str(count), choices)}")
+            known = ", ".join(map(str, written)) or "none"
+            raise UserError(f"{file}: {key}: '{place}' writes no snapshot {count}, its data.{SNAPSHOTS} are {known}")

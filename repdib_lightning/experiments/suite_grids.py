@@ -81,7 +81,7 @@ def read_grid(file: Path, name: str, content: Any, common: Common) -> Grid:
         if any(setting.name == label for setting in settings):
             raise UserError(f"{file}: {key} has two settings called '{label}'; give their files different names")
         made = _setting(file, key, Setting(name, label, (), {}, {}, finetune=finetune), (fixed, given), own)
-        settings.append(made)
+        settings.append(_from_snapshots(file, content, made, own))
     names = [setting.name for setting in settings]
     baseline = str(content.get("baseline", names[0]))
     if baseline not in names:
@@ -208,11 +208,18 @@ def _setting(file: Path, key: str, bare: Setting, parts: Sequence[Mapping[str, A
         options = {"data.path": str(own.data), **options}
     together = _together(configs, options)
     finetune = None if bare.finetune is None else bare.finetune.of_an_encoder()
-    if finetune is not None:
-        frames = read_snapshots(file, f"{key}.finetune.{SNAPSHOTS}", own.finetune.get(SNAPSHOTS))
-        check_snapshots(file, f"{key}.finetune.{SNAPSHOTS}", frames, bare.place, together)
-        finetune = finetune.from_snapshots(frames)
     return replace(bare, configs=tuple(configs), options=options, merged=together, data=own.data, finetune=finetune)
+
+
+def _from_snapshots(file: Path, content: Mapping[str, Any], setting: Setting, own: Common) -> Setting:
+    """The setting with its fine-tunings from every snapshot; without pre-training it has none."""
+    if not setting.pretrained or setting.finetune is None:
+        return setting
+    listed_here = SNAPSHOTS in (content.get("finetune") or {})
+    key = f"grids.{setting.grid}.finetune.{SNAPSHOTS}" if listed_here else f"finetune.{SNAPSHOTS}"
+    frames = read_snapshots(file, key, own.finetune.get(SNAPSHOTS))
+    check_snapshots(file, key, frames, setting.place, setting.merged)
+    return replace(setting, finetune=setting.finetune.from_snapshots(frames))
 
 
 def _is_pretrained(file: Path, key: str, given: Mapping[str, Any], bare: Setting) -> bool:
@@ -276,6 +283,9 @@ def _check_finetune_options(file: Path, key: str, options: Mapping[Any, Any], kn
             raise UserError(f"{file}: {key}: {option!r} is no option of finetune, such as steps")
         if option == SNAPSHOT:
             raise UserError(f"{file}: {key}: '{option}' is one of several; list them as {SNAPSHOTS} beside 'runs'")
+        other = next((place for place in PLACES if place in known), "")
+        if option in PLACES and option not in known and other:
+            raise UserError(f"{file}: {key}: '{option}' is not known; this agent takes '{other}'")
         if option in SET_FOR_FINETUNE:
             raise UserError(f"{file}: {key}: '{option}' follows from the suite's seeds and runs; leave it out")
         check_choice(file, key, option.partition(".")[0], known)

@@ -13,6 +13,7 @@ from repdib_lightning.bottlenecks.precision import at_least_single, without_auto
 from repdib_lightning.encoders.convolutional import initialise_orthogonally
 from repdib_lightning.errors import UserError
 from repdib_lightning.objectives.base import Encode, Objective, require_futures, require_several
+from repdib_lightning.objectives.batch_standardisation import BatchStandardisation
 from repdib_lightning.objectives.momentum import MomentumCopy
 from repdib_lightning.processes import gather_with_gradients, rows_of_all, sum_over_processes
 from repdib_lightning.records import Batch, DataSpec, ObjectiveOutput
@@ -34,6 +35,10 @@ class Prototypes(Objective):
     The rows of C are divided by their length at each use, where the published program overwrites them before each step:
     so the gradient is that of what is computed, and evaluation changes no weight. Weights start orthogonal, as there.
 
+    With ``standardise`` each dimension of f(h), and of f'(h'), is first brought to mean 0 and deviation 1 over the
+    batch. Frames of one environment are so alike that without it all embeddings point the same way; being all the same
+    is then what lowers the loss fastest (to log K), and within some ten thousand steps it does not recover.
+
     Where several processes train, the batch that is spread over the prototypes is that of all of them, so that the
     mean of their losses is the loss of the global batch.
 
@@ -50,6 +55,7 @@ class Prototypes(Objective):
         hidden: width of the projector's hidden layer.
         temperature: tau; divides the cosines.
         sinkhorn_iterations: rounds of :func:`sinkhorn`.
+        standardise: see above; not in the published program.
         target_rate: how far the target network and f' follow in a step, in (0, 1].
 
     Attributes:
@@ -69,6 +75,7 @@ class Prototypes(Objective):
         hidden: int = 512,
         temperature: float = 0.1,
         sinkhorn_iterations: int = 3,
+        standardise: bool = False,
         target_rate: float = 0.05,
     ) -> None:
         super().__init__()
@@ -93,6 +100,8 @@ class Prototypes(Objective):
         self.prototypes = nn.Linear(projected, prototypes, bias=False)
         self.apply(initialise_orthogonally)
         self.target_predictor = MomentumCopy(self.predictor, target_rate)
+        self.standardised = BatchStandardisation(projected) if standardise else nn.Identity()
+        self.target_standardised = BatchStandardisation(projected) if standardise else nn.Identity()
 
     def forward(self, batch: Batch, encode: Encode, target: Encode | None = None) -> ObjectiveOutput:
         """Encode the anchors by the online network and the last frames by the target, once each.
@@ -106,10 +115,10 @@ class Prototypes(Objective):
         online = encode({name: frames[:, :1] for name, frames in batch.observations.items()})[:, 0]
         later = target({name: frames[:, -1:] for name, frames in batch.observations.items()})[:, 0]
         with without_autocast(online):
-            predicted = self.projector(self.predictor(online.to(self.predictor.weight.dtype)))
+            predicted = self.projector(self.standardised(self.predictor(online.to(self.predictor.weight.dtype))))
             log_chosen = (self._cosines(_unit(predicted)) / self.temperature).log_softmax(-1)
             with torch.no_grad():
-                averaged = _unit(self.target_predictor.apply_to(self.predictor, later))
+                averaged = _unit(self.target_standardised(self.target_predictor.apply_to(self.predictor, later)))
                 assigned = sinkhorn(self._cosines(averaged) / self.temperature, self.sinkhorn_iterations)
             loss = -(assigned * log_chosen).sum(-1).mean()
         return ObjectiveOutput({"prototypes": loss}, _describe_use(log_chosen.detach()))
@@ -117,7 +126,9 @@ class Prototypes(Objective):
     def embed(self, latents: Tensor) -> Tensor:
         """f(h) / |f(h)|: latents (N, M) to unit vectors (N, P), where distances are measured (ProtoRL)."""
         with without_autocast(latents):
-            return _unit(self.predictor(latents.to(self.predictor.weight.dtype)))
+            predicted = self.predictor(latents.to(self.predictor.weight.dtype))
+            known = self.standardised
+            return _unit(known.as_before(predicted) if isinstance(known, BatchStandardisation) else predicted)
 
     @torch.no_grad()
     def candidates(self, embeddings: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from repdib_lightning.data.files import whole_file
+from repdib_lightning.environments.urlb_tasks import domain_of
 from repdib_lightning.errors import UserError
 from repdib_lightning.export.gymnasium_wrapper import EncodeObservation
 from repdib_lightning.records import ArraySpec
@@ -112,22 +113,24 @@ class DDPGTraining(OnlineTraining):
 
     def _load(self) -> None:
         assert self.given.agent is not None
-        loaded = self.given.agent.part("actor.")
-        actions = len(loaded["network.4.bias"]) if "network.4.bias" in loaded else 0
-        if actions != self.actions:
-            explored = f"{self.given.facts.get('task', 'another task')}, whose actions are {actions} wide"
-            raise UserError(
-                f"--task {self.task}: its actions are {self.actions} wide, the agent of {self.given.bundle} "
-                f"explored {explored}; choose a task of the same domain, or --agent fresh"
-            )
+        self._check_domain()
         try:
-            self.agent.actor.load_state_dict(loaded)
+            self.agent.actor.load_state_dict(self.given.agent.part("actor."))
             if self._start() == BOTH:
                 self.agent.critic.load_state_dict(self.given.agent.part("critic."))
                 self.agent.target.load_state_dict(self.given.agent.part("target."))
         except RuntimeError as error:
             reason = str(error).splitlines()[-1].strip()
             raise UserError(f"{self.given.agent.path}: does not fit its encoder ({reason})") from error
+
+    def _check_domain(self) -> None:
+        explored, actions = str(self.given.facts["task"]), int(self.given.facts["actions"])
+        domain = domain_of(explored)
+        if domain != domain_of(self.task) or actions != self.actions:
+            raise UserError(
+                f"--task {self.task}: has {self.actions} actions, the agent of {self.given.bundle} explored "
+                f"{explored}, which has {actions}; choose a task of {domain}, or --agent fresh"
+            )
 
     def _check_batch(self) -> None:
         """Only whole episodes are drawn from, and the last of the seed actions is still under way."""
@@ -208,12 +211,12 @@ class DDPGTraining(OnlineTraining):
         Raises:
             Spoiled: a loss or a value is not sound; nothing has followed it then.
         """
+        self.last_good.offer()
         seen, later = self._features(batch)
         assert batch.actions is not None
         actions, returns, discounts = (part.to(self.device) for part in (batch.actions, batch.returns, batch.discounts))
         loss, value = self.agent.critic_loss(seen, later, actions, returns, discounts)
         check_sound({"critic": float(loss.detach()), "value": float(value)}, self.options.value_limit)
-        self.last_good.offer()
         self.last_good.accept()
         descend(loss, self.of_critic)
         of_actor = self.agent.actor_loss(seen)

@@ -135,7 +135,8 @@ class BottleneckSAC(SAC):
         self.last_good.accept()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_followed", "last_good", "latest", "_value"]
+        ours = "_followed", "last_good", "latest", "_value"
+        return [*super()._excluded_save_params(), *ours, "replay_buffer_class"]  # which a loaded agent would warn of
 
 
 def _running(network: nn.Module) -> list[Tensor]:

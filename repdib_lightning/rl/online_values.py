@@ -28,7 +28,7 @@ class SeenValues:
     def save(self, path: Path) -> None:
         """Write ``latents`` (n, M) float16 and ``values`` (n,) float32 of n rows, evenly spread over the episodes.
 
-        n is 1000, or less where the file would be larger than a megabyte: 463 at M = 1024.
+        n is 1000, or less where the file would be larger than a megabyte: 462 at M = 1024.
         """
         latents, values = np.concatenate(self._latents), np.concatenate(self._values)
         most = min(MOST_ROWS, _MOST_BYTES // (2 * latents.shape[1] + 4), len(latents))

