@@ -142,7 +142,7 @@ def collections(data: Any, rounds: int) -> None:
 
 def collected(data: Any, count: int, processes: bool) -> tuple[float, float]:
     """Actions a second, start-up left out, and the share of all cores' time that was used."""
-    schedule = Schedule(count, data.plan.steps, ACTIONS * count, 0, ACTIONS * count)
+    schedule = Schedule(count, data.plan.steps, ACTIONS * count, 0, ACTIONS * count, 0)
     plan = replace(data.plan, episodes=schedule.episodes)
     with tempfile.TemporaryDirectory() as folder:
         replay = Replay(Path(folder) / "replay.h5", plan, seed=0)

@@ -21,15 +21,27 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 """Okabe and Ito's palette, told apart by readers with any colour vision."""
 
+_HARDLY_SEEN = 0.5
+"""Mean change of a pixel's colours, of 255."""
+
 SHOULD = {"endogenous": "State kept (high is good)", "exogenous": "Noise kept (low is good)"}
 
 
 def png(figure: Figure, dpi: int = 110) -> bytes:
-    """Draw a figure, small and opaque; the same figure gives the same bytes."""
-    drawn, opaque = io.BytesIO(), io.BytesIO()
+    """Draw a figure, small and opaque, in 256 colours where that is hardly seen; the same figure gives the same bytes."""
+    drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=dpi)
-    Image.open(drawn).convert("RGB").save(opaque, "PNG", optimize=True)
-    return opaque.getvalue()
+    return small_png(Image.open(drawn))
+
+
+def small_png(picture: Image.Image) -> bytes:
+    """A PNG file of a picture, in 256 colours where no pixel but a few changes by much."""
+    whole = picture.convert("RGB")
+    few = whole.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    changed = np.abs(np.asarray(few.convert("RGB"), np.int16) - np.asarray(whole, np.int16)).mean()
+    content = io.BytesIO()
+    (few if changed <= _HARDLY_SEEN else whole).save(content, "PNG", optimize=True)
+    return content.getvalue()
 
 
 def panel_grid(count: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:

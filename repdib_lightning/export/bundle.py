@@ -73,7 +73,7 @@ def save_bundle(
     _check_trained([*modules.values(), *heads.values()])
     config = bundle_config(encoder, bottleneck, training, data, heads)
     content = tensors_to_bytes(_weights(nn.ModuleDict(modules)))
-    with _whole_folder(target) as aside:
+    with whole_folder(target) as aside:
         for key, head in heads.items():
             (aside / HEADS[key].weights).write_bytes(tensors_to_bytes(_weights(head)))
         beside = [HEADS[key].weights for key in heads]
@@ -123,7 +123,7 @@ def _check_target(target: Path, overwrite: bool) -> None:
 
 
 @contextmanager
-def _whole_folder(target: Path) -> Iterator[Path]:
+def whole_folder(target: Path) -> Iterator[Path]:
     """Yield a temporary sibling folder; on success it takes the target's place, on error it vanishes."""
     aside = target.with_name(f".{target.name}.tmp-{os.getpid()}")
     previous = target.with_name(f".{target.name}.old-{os.getpid()}")

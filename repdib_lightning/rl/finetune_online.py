@@ -33,6 +33,7 @@ def finetune_ddpg(
     tau: float = 0.01,
     noise: float = 0.2,
     noise_clip: float = 0.3,
+    standardise: bool | None = None,
     update_every: int = 2,
     seed_frames: int = 4_000,
     shift: int | None = None,
@@ -49,11 +50,10 @@ def finetune_ddpg(
 ) -> str:
     """Fine-tune DDPG to a task of URLB or the Control Suite (paper, continuous control), from a snapshot or scratch.
 
-    With a frozen encoder each frame is encoded once, and agent and replay see vectors, as they are: nothing is
-    standardised. Else the critic trains encoder and bottleneck on randomly shifted pictures, after DrQ-v2. Writes
-    ``progress.csv``, ``outcome.json``, ``policy.safetensors``, ``values.npz`` (latents and values of the last
-    evaluation), ``evaluation.mp4``, TensorBoard files, and ``bundle/`` where the encoder is no longer the one that was
-    given, into the run's folder.
+    With a frozen encoder each frame is encoded once, and agent and replay see vectors. Else the critic trains encoder
+    and bottleneck on randomly shifted pictures, after DrQ-v2. Writes ``progress.csv``, ``outcome.json``,
+    ``policy.safetensors``, ``values.npz`` (latents and values of the last evaluation), ``evaluation.mp4``, TensorBoard
+    files, and ``bundle/`` where the encoder is no longer the one that was given, into the run's folder.
 
     Args:
         encoder: a run of exploration, a snapshot of one, or any bundle. Without one, a fresh encoder is trained.
@@ -80,6 +80,8 @@ def finetune_ddpg(
         tau: rate at which the target critic follows.
         noise: deviation of the noise on actions, that explore and that are bootstrapped from.
         noise_clip: where the latter's is clipped.
+        standardise: whether actor and critics see features less their running mean, over their deviation; by default
+            as the agent that is taken over did, else true.
         update_every: actions between two updates.
         seed_frames: before the first update; one episode at least.
         shift: largest random shift of the pictures of an encoder that is trained; 4 pixels by default.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,7 +24,7 @@ from repdib_lightning.errors import UserError
 from repdib_lightning.export.gymnasium_wrapper import EncodeObservation
 from repdib_lightning.records import ArraySpec
 from repdib_lightning.rl.actor_critic import descend
-from repdib_lightning.rl.exploration.collection import Collection, Schedule
+from repdib_lightning.rl.exploration.collection import Collection
 from repdib_lightning.rl.exploration.ddpg import DDPG
 from repdib_lightning.rl.exploration.replay import Replay, ReplayBatch, ReplayPlan
 from repdib_lightning.rl.last_good import LastGood, Spoiled, check_sound
@@ -36,26 +36,6 @@ from repdib_lightning.rl.policy_file import POLICY
 
 LATENTS = "latents"
 """Name of the observation of a replay that holds no pictures."""
-
-
-@dataclass(frozen=True)
-class ActorFirst(Schedule):
-    """A schedule whose seed actions are the policy's, not random ones.
-
-    Attributes:
-        waits: actions before the first update; ``seed`` is 0.
-    """
-
-    waits: int = 0
-
-    @property
-    def updates(self) -> int:
-        """Until the last action."""
-        return max(0, self.total - self.waits) // self.update_every
-
-    def actions_before(self, update: int) -> int:
-        """How many actions have been taken when an update (from 0 on) is due."""
-        return self.waits + update * self.update_every
 
 
 class DDPGTraining(OnlineTraining):
@@ -76,8 +56,15 @@ class DDPGTraining(OnlineTraining):
         options = self.options
         loaded = self._start() != NEW
         self.hidden = self._hidden() if loaded else options.hidden or HIDDEN
-        noise = {"noise": options.noise, "noise_clip": options.noise_clip}
-        self.agent = DDPG(self.width, self.actions, hidden=self.hidden, tau=options.tau, **noise)
+        self.agent = DDPG(
+            self.width,
+            self.actions,
+            hidden=self.hidden,
+            tau=options.tau,
+            noise=options.noise,
+            noise_clip=options.noise_clip,
+            standardise=self._standardise(),
+        )
         if loaded:
             self._load()
         self.agent.to(self.device)
@@ -87,7 +74,8 @@ class DDPGTraining(OnlineTraining):
             self.trained = TrainedFeatures(*self.parts, options.pixels, options.losses_weight)
         seen_with = [] if self.trained is None else list(self.trained.parameters())
         self.of_critic, self.of_actor = self.agent.build_optimizers(options.learning_rate, seen_with)
-        self.last_good = LastGood([self.agent.actor] + ([] if self.trained is None else [self.trained]))
+        followed = [self.agent.actor, self.agent.statistics, self.trained]
+        self.last_good = LastGood([module for module in followed if module is not None])
         self.latest: dict[str, Tensor] = {}
 
     def _start(self) -> str:
@@ -102,7 +90,7 @@ class DDPGTraining(OnlineTraining):
 
     def resolved(self) -> dict[str, Any]:
         """And what the agent began with."""
-        return super().resolved() | {"agent": self._start()}
+        return super().resolved() | {"agent": self._start(), "standardise": self._standardise()}
 
     def _hidden(self) -> int:
         assert self.given.agent is not None
@@ -111,11 +99,25 @@ class DDPGTraining(OnlineTraining):
             raise UserError(f"--hidden {chosen}: the agent of {self.given.bundle} has {hidden}; leave it out")
         return hidden
 
+    def _standardise(self) -> bool:
+        chosen = self.options.standardise
+        if self._start() == NEW:
+            return True if chosen is None else chosen
+        explored = bool(self.given.facts.get("standardise", False))
+        if chosen not in (None, explored):
+            told = f"was {'' if explored else 'not '}trained on standardised features"
+            raise UserError(
+                f"--standardise {str(chosen).lower()}: the agent of {self.given.bundle} {told}; leave it out"
+            )
+        return explored
+
     def _load(self) -> None:
         assert self.given.agent is not None
         self._check_domain()
         try:
             self.agent.actor.load_state_dict(self.given.agent.part("actor."))
+            if self.agent.statistics is not None:
+                self.agent.statistics.load_state_dict(self.given.agent.part("statistics."))
             if self._start() == BOTH:
                 self.agent.critic.load_state_dict(self.given.agent.part("critic."))
                 self.agent.target.load_state_dict(self.given.agent.part("target."))
@@ -149,8 +151,7 @@ class DDPGTraining(OnlineTraining):
 
     def values(self, features: Tensor, actions: Tensor) -> Tensor:
         """(n, M) and (n, A) to (n,)."""
-        smaller: Tensor = self.agent.critic(features, actions).amin(0)
-        return smaller
+        return self.agent.values_of(features, actions)
 
     def explore(self, observations: dict[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
         """Actions (E, A) that explore, for latents (E, M) or pictures, and standard normal noise (E, A)."""
@@ -202,7 +203,7 @@ class DDPGTraining(OnlineTraining):
             seed=options.seed,
         )
         if self._start() != NEW:
-            schedule = ActorFirst(**{**vars(schedule), "seed": 0}, waits=schedule.seed)
+            schedule = replace(schedule, random=0)
         return Collection([lambda: environment], replay, schedule, seed=options.seed)
 
     def update(self, batch: ReplayBatch) -> None:
@@ -246,7 +247,16 @@ class DDPGTraining(OnlineTraining):
 
     def save(self, folder: Path, encoder: Path | None) -> None:
         """Write ``policy.safetensors``, which :func:`~repdib_lightning.rl.policy_file.load_policy` reads."""
-        tensors = {f"actor.{name}": value.cpu().contiguous() for name, value in self.agent.actor.state_dict().items()}
+        tensors = {f"actor.{name}": value for name, value in self.agent.actor.state_dict().items()}
+        if self.agent.statistics is not None:
+            tensors |= {
+                "standardise.mean": self.agent.statistics.mean,
+                "standardise.scale": self.agent.statistics.scale,
+            }
         facts = {"agent": self.options.algorithm, "encoder": None if encoder is None else str(encoder)}
         with whole_file(folder / POLICY) as aside:
-            save_file(tensors, aside, {"policy": json.dumps(facts)})
+            save_file(
+                {name: value.detach().cpu().contiguous() for name, value in tensors.items()},
+                aside,
+                {"policy": json.dumps(facts)},
+            )

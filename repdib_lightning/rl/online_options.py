@@ -96,6 +96,7 @@ class DDPGOptions(OnlineOptions):
     agent: str | None
     noise: float
     noise_clip: float
+    standardise: bool | None
 
 
 @dataclass(frozen=True, kw_only=True)

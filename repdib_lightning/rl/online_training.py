@@ -41,8 +41,6 @@ from repdib_lightning.versions import versions
 class OnlineTraining(ABC):
     """Builds everything, so that whatever does not fit shows before a folder is made.
 
-    Agents see latents as the encoder gives them: they are not standardised, since the agent that explored saw them so.
-
     Args:
         options: of the verb.
 

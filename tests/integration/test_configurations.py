@@ -100,7 +100,11 @@ def here(tmp_path, monkeypatch, recording, maze_recording, control_recording, dr
 
 PAPER = "paper/vd4rl/multi_step_inverse"
 HAMLET, MMACT = "activities/hamlet", "paper/mmact/hamlet"
-BASES = ("robot_arm", "mazes", "control", "factors", HAMLET, f"{HAMLET}_repdib", PAPER, MMACT)
+EXPLORATION, PAPER_EXPLORATION = "urlb/walker_repdib", "paper/urlb/walker"
+BASES = (
+    *("robot_arm", "mazes", "control", "factors", HAMLET, f"{HAMLET}_repdib", PAPER, MMACT),
+    *(EXPLORATION, PAPER_EXPLORATION),
+)
 """Configurations of a whole run; the others are laid over one of them."""
 
 OVERLAYS = [name for name in packaged() if name not in BASES]
@@ -121,14 +125,21 @@ LAYERS = [
     [HAMLET, "activities/smartwatch", "activities/smartwatch_sides", "debug"],
     [HAMLET, "activities/smartwatch", "activities/statistics"],
     [MMACT, f"{MMACT}_repdib"],
+    *([EXPLORATION, f"bottleneck/{name}"] for name in ("none", "vq")),
+    *([EXPLORATION, f"urlb/{domain}_repdib"] for domain in ("quadruped", "jaco")),
+    *([PAPER_EXPLORATION, f"paper/urlb/{domain}"] for domain in ("quadruped", "jaco")),
 ]
+FEW_FRAMES = ["--data.frames", "5000", "--data.seed_frames", "1000", "--data.snapshots", "[]",
+              "--data.action_repeat", "25", "--data.image_size", "32", "--data.processes", "false",
+              "--data.environments", "2"]  # fmt: skip
 ON_A_CPU = ["--trainer.accelerator", "cpu", "--trainer.precision", "32-true"]
 
 
 @pytest.mark.parametrize("layers", LAYERS, ids="+".join)
 def test_every_configuration_trains(here, layers):
     configurations = [argument for name in layers for argument in ("--config", name)]
-    assert main(["fit", *configurations, *SMALL, *ON_A_CPU, "--run", "runs/x"]) == 0
+    small = [*SMALL, *FEW_FRAMES] if "urlb/" in layers[0] else SMALL
+    assert main(["fit", *configurations, *small, *ON_A_CPU, "--run", "runs/x"]) == 0
     assert Path("runs/x/checkpoints/step-00000003.ckpt").is_file()
     written = {path.name for path in Path("runs/x").iterdir()}
     assert {"config.yaml", "status.json", "metrics.csv", "environment.json", "bundle.json"} <= written

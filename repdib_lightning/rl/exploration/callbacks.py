@@ -11,6 +11,7 @@ import numpy as np
 from lightning.pytorch.callbacks import Callback
 from PIL import Image
 
+from repdib_lightning.bottlenecks import VectorQuantiser
 from repdib_lightning.callbacks.pictures import tensorboards
 from repdib_lightning.errors import UserError
 from repdib_lightning.rl.exploration.data import VIEW, ExplorationDataModule
@@ -51,11 +52,13 @@ class ExplorationProgress(Callback):
         told = {"explore/coverage": float(self._cells.visited), "explore/frames": float(data.frames_done)}
         if returns := data.take_returns():
             told["explore/task_return"] = float(np.mean(returns))
+        step = trainer.global_step - 1  # of the batch, as in all other rows: a run that goes on drops later ones
         for logger in trainer.loggers:
-            logger.log_metrics(told, trainer.global_step)
+            logger.log_metrics(told, step)
+            logger.save()  # the checkpoint that follows says that this is told
         if first.bit_length() != self._counted.bit_length():
             for writer in tensorboards(trainer):
-                add_film(writer, "explore/episode", film_of(replay, self._counted - 1), trainer.global_step)
+                add_film(writer, "explore/episode", film_of(replay, self._counted - 1), step)
 
     def _visit(self, replay: Replay, first: int) -> None:
         """Count the states of episodes that were not counted; all of them where a run goes on."""
@@ -81,7 +84,7 @@ class Snapshots(Callback):
             raise UserError("trainer.devices: an exploration runs in one process; set trainer.devices to 1")
         data = _data_of(trainer)
         self._looked_at = data.frames_done
-        starts = [int(m.start_step) for m in pl_module.modules() if isinstance(getattr(m, "start_step", None), int)]
+        starts = [module.start_step for module in pl_module.modules() if isinstance(module, VectorQuantiser)]
         for frames in data.snapshots[:1]:
             updates = (frames // data.action_repeat - data.schedule.seed) // data.update_every
             if updates <= max(starts, default=-1):
@@ -135,6 +138,7 @@ class Snapshots(Callback):
                 "action_repeat": data.action_repeat,
                 **data.scene,
                 "hidden": pl_module.hidden,
+                "standardise": pl_module.standardise,
                 "features": pl_module.encoder.features,
                 "actions": data.actions,
             },

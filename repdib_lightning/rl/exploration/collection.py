@@ -28,7 +28,8 @@ class Schedule:
 
     Attributes:
         environments: E, stepped together. episode: actions of one, T.
-        total: actions in all. seed: random ones before the first update. update_every: actions between two updates.
+        total: actions in all. seed: before the first update. update_every: between two updates.
+        random: of the first ones, which are drawn evenly; the policy is asked for all later ones.
     """
 
     environments: int
@@ -36,6 +37,7 @@ class Schedule:
     total: int
     seed: int
     update_every: int
+    random: int
 
     @classmethod
     def of_frames(
@@ -49,7 +51,7 @@ class Schedule:
         together = environments * episode
         total = math.ceil(frames / (together * action_repeat)) * together
         seed = max(math.ceil(seed_frames / action_repeat), together + environments)
-        return cls(environments, episode, total, seed, update_every)
+        return cls(environments, episode, total, seed, update_every, seed)
 
     @property
     def episodes(self) -> int:
@@ -131,10 +133,10 @@ class Collection:
         processes: bool = False,
     ) -> None:
         self.replay, self.schedule, self.seed = replay, schedule, seed
-        manual = {"autoreset_mode": AutoresetMode.DISABLED, "copy": True}
+        manual: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED, "copy": True}
         self._processes, self._pending = processes, False
         with _living_workers():
-            self._vector = (
+            self._vector: Any = (
                 AsyncVectorEnv(environments, context="spawn", **manual)
                 if processes
                 else SyncVectorEnv(environments, **manual)
@@ -153,7 +155,7 @@ class Collection:
         """Step the environments until the next update is due; the last step is left under way.
 
         Args:
-            act: the policy, asked once the seed actions are over.
+            act: the policy, asked once the random actions are over.
         """
         due = self.schedule.actions_before(self.updates_done)
         while self.steps < due:
@@ -182,7 +184,7 @@ class Collection:
         """(E, A) float32: random ones at first, then those of the policy."""
         random = np.random.Generator(np.random.Philox(key=self._key(_SEED_OF_ACTIONS, self.steps)))
         shape = (len(self._playing), self.plan.actions)
-        if self.steps < self.schedule.seed:
+        if self.steps < self.schedule.random:
             return random.uniform(-1.0, 1.0, shape).astype(np.float32)
         return np.asarray(act(self.observations(), random.standard_normal(shape).astype(np.float32)), np.float32)
 

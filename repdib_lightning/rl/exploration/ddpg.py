@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from repdib_lightning.rl.actor_critic import adam, critic_loss, descend, follow, noisy, smaller_value
+from repdib_lightning.rl.exploration.running_statistics import RunningStatistics
 from repdib_lightning.rl.networks import Actor, TwinCritic
 
 
@@ -19,10 +20,15 @@ class DDPG(nn.Module):
     - actor: - mean min_j Q_j(s, clip(pi(s) + e)), on detached features;
     - e: normal with ``noise``, clipped at ``noise_clip``; the target critic follows at the rate tau.
 
+    With ``standardise``, actor and critics see each feature less its running mean over its running deviation: frames of
+    one environment are alike, and what differs between their latents is small beside what they share. The averages are
+    taken over what the critic is trained on, and saved with the agent.
+
     Args:
         features: M. actions: A. hidden: width of the two hidden layers.
         tau: rate of the target critic. noise, noise_clip: of the actions; exploring actions are not clipped but to
             [-1, 1].
+        standardise: see above; not in the published programs.
     """
 
     def __init__(
@@ -34,8 +40,10 @@ class DDPG(nn.Module):
         tau: float = 0.01,
         noise: float = 0.2,
         noise_clip: float = 0.3,
+        standardise: bool = False,
     ) -> None:
         super().__init__()
+        self.statistics = RunningStatistics(features) if standardise else None
         self.actor, self.critic = Actor(features, actions, hidden), TwinCritic(features, actions, hidden)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.tau, self.noise, self.noise_clip = tau, noise, noise_clip
@@ -43,14 +51,23 @@ class DDPG(nn.Module):
     @torch.no_grad()
     def act(self, features: Tensor, noise: Tensor | None = None) -> Tensor:
         """(B, M) to actions (B, A); with standard normal noise (B, A), scaled, where it explores."""
-        actions: Tensor = self.actor(features)
+        actions: Tensor = self.actor(self.seen(features))
         return actions if noise is None else (actions + self.noise * noise).clamp(-1.0, 1.0)
 
     @torch.no_grad()
     def values(self, features: Tensor) -> Tensor:
         """(B, M) to (B,): the smaller value of the actor's own action."""
-        values: Tensor = self.critic(features, self.actor(features)).amin(0)
+        return self.values_of(features, self.act(features))
+
+    @torch.no_grad()
+    def values_of(self, features: Tensor, actions: Tensor) -> Tensor:
+        """(B, M) and (B, A) to (B,): the smaller value of these actions."""
+        values: Tensor = self.critic(self.seen(features), actions).amin(0)
         return values
+
+    def seen(self, features: Tensor) -> Tensor:
+        """What actor and critics see of features (B, M)."""
+        return features if self.statistics is None else self.statistics(features)
 
     def critic_loss(
         self, seen: Tensor, later: Tensor, actions: Tensor, returns: Tensor, discounts: Tensor
@@ -61,13 +78,16 @@ class DDPG(nn.Module):
             seen, later: features (B, M) of t and of t + m; ``seen`` may carry a gradient.
             actions: (B, A), at t. returns, discounts: (B,).
         """
+        if self.statistics is not None:
+            self.statistics.take_in(seen.detach())
+        seen, later = self.seen(seen), self.seen(later)
         with torch.no_grad():
             values = self.target(later, noisy(self.actor(later), self.noise, self.noise_clip)).amin(0)
         return critic_loss(self.critic, seen, actions, returns, discounts, values)
 
     def actor_loss(self, seen: Tensor) -> Tensor:
         """Scalar loss on features (B, M), which get no gradient."""
-        seen = seen.detach()
+        seen = self.seen(seen.detach())
         acted = noisy(self.actor(seen), self.noise, self.noise_clip)
         return -smaller_value(self.critic, seen, acted).mean()
 

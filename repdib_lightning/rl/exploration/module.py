@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -49,6 +50,7 @@ class ExplorationModule(RepresentationModule):
         hidden: width of the two hidden layers of actor and critics.
         agent_learning_rate: Adam's, of actor and critics. tau: rate of the target critic.
         noise: deviation of the exploring noise, and of that in the losses, which is clipped at ``noise_clip``.
+        standardise: whether actor and critics see latents less their mean, over their deviation.
         reward_on: what is compared: the ``latent`` behind the bottleneck (paper: the discrete factorial embedding), the
             encoder's ``features`` before it, or its ``codes``, by the share of groups that differ.
         queue: what was seen that is remembered. neighbours: k, distance to the k-th nearest.
@@ -77,6 +79,7 @@ class ExplorationModule(RepresentationModule):
         tau: float = 0.01,
         noise: float = 0.2,
         noise_clip: float = 0.3,
+        standardise: bool = False,
         reward_on: RewardOn = "latent",
         queue: int = 2048,
         neighbours: int = 3,
@@ -86,7 +89,7 @@ class ExplorationModule(RepresentationModule):
         super().__init__(encoder, bottleneck, objective, optimizer, None, loss_weights, warmup, shift)
         self.automatic_optimization = False
         self.hidden, self.agent_learning_rate = hidden, agent_learning_rate
-        self.tau, self.noise, self.noise_clip = tau, noise, noise_clip
+        self.tau, self.noise, self.noise_clip, self.standardise = tau, noise, noise_clip, standardise
         self.reward_on, self.queue, self.neighbours, self.duplicates = reward_on, queue, neighbours, duplicates
         self.value_limit = value_limit
         if reward_on not in REWARDS_ON:
@@ -94,6 +97,8 @@ class ExplorationModule(RepresentationModule):
         for name in ("hidden", "agent_learning_rate", "tau", "value_limit"):
             if not getattr(self, name) > 0:
                 raise UserError(f"model.{name} must be above 0, is {getattr(self, name)}")
+        if self.tau > 1:
+            raise UserError(f"model.tau must be at most 1, is {self.tau}")
         for name in ("noise", "noise_clip"):
             if not getattr(self, name) >= 0:
                 raise UserError(f"model.{name} must not be negative, is {getattr(self, name)}")
@@ -112,6 +117,7 @@ class ExplorationModule(RepresentationModule):
             tau=self.tau,
             noise=self.noise,
             noise_clip=self.noise_clip,
+            standardise=self.standardise,
         )
         on_codes = self.reward_on == "codes"
         self.reward = NearestNeighbourReward(
@@ -146,22 +152,24 @@ class ExplorationModule(RepresentationModule):
             (E, A) float32 in [-1, 1].
         """
         seen = {name: torch.from_numpy(array).to(self.device) for name, array in observations.items()}
-        with torch.no_grad():
-            latents = self._still(seen).latent
+        with self._still():
+            latents = self(seen).latent
             drawn = None if noise is None else torch.from_numpy(noise).to(self.device)
             actions: np.ndarray = self.agent.act(latents, drawn).cpu().numpy()
         return actions
 
-    @torch.no_grad()
-    def _still(self, observations: dict[str, Tensor]) -> BottleneckOutput:
-        """Encode (N, *shape) without noise, and without a trace in codebooks and statistics."""
+    @contextmanager
+    def _still(self) -> Iterator[None]:
+        """Encode without gradient and noise, and without a trace in codebooks and statistics."""
         modules = [module for part in (self.encoder, self.bottleneck) for module in part.modules() if module.training]
         for module in modules:
             module.training = False
-        output: BottleneckOutput = self(observations)
-        for module in modules:
-            module.training = True
-        return output
+        try:
+            with torch.no_grad():
+                yield
+        finally:
+            for module in modules:
+                module.training = True
 
     def training_step(self, batch: Batch, batch_index: int) -> dict[str, Any]:
         """One update of the representation, one of the critics, one of the actor.
@@ -170,7 +178,9 @@ class ExplorationModule(RepresentationModule):
             BrokenExploration: the critics' loss is not finite, or their values have exploded; they stay as they were.
         """
         assert isinstance(batch, ReplayBatch)
-        of_representation, of_critic, of_actor = self.optimizers()  # type: ignore[misc]
+        optimizers: Any = self.optimizers()
+        of_representation, of_critic, of_actor = optimizers
+        written = self._writes_this_step()  # told by the count that the optimiser's step will change
         shifted = {name: self._shifted(pairs) for name, pairs in batch.observations.items()}
         batch = replace(batch, observations=shifted)
         output = self._evaluate(batch)
@@ -178,25 +188,29 @@ class ExplorationModule(RepresentationModule):
         loss = torch.stack(list(terms.values())).sum()
         descend(loss, of_representation)  # the only step that Lightning counts
         self.follow_target()
-        seen, later, rewards, told = self._rewarded(batch)
+        seen, later, rewards, told = self._rewarded(batch, duplicates=written)
+        assert batch.actions is not None
         of_values, value = self.agent.critic_loss(seen, later, batch.actions, rewards, batch.discounts)
         self._check_values(of_values, value)
         descend(of_values, of_critic.optimizer)
         of_policy = self.agent.update_actor(seen, of_actor.optimizer)
         told |= {"critic_loss": of_values.detach(), "value": value, "actor_loss": of_policy}
-        if self._writes_this_step():
+        if written:
             self._log(named_values("train", loss, output, terms) | {f"explore/{name}": v for name, v in told.items()})
         return {"loss": loss.detach(), "terms": {name: value.detach() for name, value in output.losses.items()}}
 
-    def _rewarded(self, batch: ReplayBatch) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
+    def _rewarded(
+        self, batch: ReplayBatch, duplicates: bool = True
+    ) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
         """Latents (B, M) of both observations, rewards (B,), and what is told of them."""
         pairs = {name: array.flatten(0, 1) for name, array in batch.observations.items()}
-        output = self._still(pairs)
+        with self._still():
+            output: BottleneckOutput = self(pairs)
         seen, later = output.latent.unflatten(0, (-1, 2)).unbind(1)
         compared, codes = self._compared(pairs, output), None
         if self.reward_on == "latent" and output.codes is not None:
             codes = output.codes[1::2]
-        told = {"duplicates": self.reward.duplicated(compared, codes)} if self._writes_this_step() else {}
+        told = {"duplicates": self.reward.duplicated(compared, codes)} if duplicates else {}
         rewards = self.reward(compared, self._entering(compared, later), codes)
         told["intrinsic_reward"] = rewards.mean()
         return seen.contiguous(), later.contiguous(), rewards, told
@@ -219,8 +233,8 @@ class ExplorationModule(RepresentationModule):
                 return torch.zeros(len(output.latent) // 2, self.reward.width, device=self.device)
             return output.codes[1::2].float()
         if self.reward_on == "features":
-            later = {name: array[1::2] for name, array in pairs.items()}
-            return self._embed(self._features(later))
+            with self._still():
+                return self._embed(self.encoder.detailed({name: array[1::2] for name, array in pairs.items()}).features)
         return self._embed(output.latent[1::2])
 
     def _embed(self, latents: Tensor) -> Tensor:

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as as_bytes
 from torch import Tensor
 
 from repdib_lightning.bottlenecks.base import Bottleneck
-from repdib_lightning.data.files import whole_file
 from repdib_lightning.encoders.base import Encoder
 from repdib_lightning.errors import UserError
-from repdib_lightning.export.bundle import save_bundle
+from repdib_lightning.export.bundle import save_bundle, whole_folder
 from repdib_lightning.export.description import CONFIG
 from repdib_lightning.rl.exploration.ddpg import DDPG
 
@@ -87,7 +86,7 @@ def write_snapshot(
     data: Mapping[str, Any],
     facts: Mapping[str, Any],
 ) -> Path:
-    """Write encoder, bottleneck and agent; an earlier snapshot there is replaced, its bundle last.
+    """Write encoder, bottleneck and agent into a folder that appears whole; an earlier snapshot there is replaced.
 
     Args:
         folder: see :func:`snapshot_folder`. training, data: of the bundle. facts: of the agent.
@@ -95,16 +94,15 @@ def write_snapshot(
     Raises:
         UserError: as :func:`~repdib_lightning.export.bundle.save_bundle`.
     """
-    (folder / AGENT).unlink(missing_ok=True)
+    tensors = {name: value.detach().cpu().contiguous() for name, value in agent.state_dict().items()}
     modes = encoder.training, bottleneck.training
     try:
-        save_bundle(folder, encoder.eval(), bottleneck.eval(), training=training, data=data, overwrite=True)
+        with whole_folder(folder) as aside:
+            save_bundle(aside, encoder.eval(), bottleneck.eval(), training=training, data=data, overwrite=True)
+            (aside / AGENT).write_bytes(as_bytes(tensors, {"agent": json.dumps(dict(facts))}))
     finally:
         encoder.train(modes[0])
         bottleneck.train(modes[1])
-    tensors = {name: value.detach().cpu().contiguous() for name, value in agent.state_dict().items()}
-    with whole_file(folder / AGENT) as aside:
-        save_file(tensors, aside, {"agent": json.dumps(dict(facts))})
     return folder
 
 

@@ -23,11 +23,11 @@ from online_snapshots import (
 from repdib_lightning.errors import UserError
 from repdib_lightning.export import load_encoder
 from repdib_lightning.export.frozen import FrozenEncoder
-from repdib_lightning.rl.exploration.collection import Collection, Schedule
+from repdib_lightning.rl.exploration.collection import Collection
 from repdib_lightning.rl.exploration.replay import ReplayBatch
 from repdib_lightning.rl.exploration.snapshots import AGENT, read_agent
 from repdib_lightning.rl.networks import Actor
-from repdib_lightning.rl.online_ddpg import ActorFirst, DDPGTraining
+from repdib_lightning.rl.online_ddpg import DDPGTraining
 from repdib_lightning.rl.policy_file import load_policy
 
 
@@ -134,13 +134,6 @@ def test_the_seed_frames_are_random_for_a_fresh_agent_and_played_by_a_loaded_one
         assert len(taken) == 3 * EPISODE and len(asked) == by_policy
         np.testing.assert_array_equal(taken[len(taken) - len(asked) :], asked)
         monkeypatch.setattr(Collection, "_send", send)
-
-
-def test_updates_come_when_they_would():
-    schedule = Schedule(environments=1, episode=20, total=60, seed=21, update_every=2)
-    first = ActorFirst(**{**vars(schedule), "seed": 0}, waits=schedule.seed)
-    assert first.updates == schedule.updates == 19 and first.seed == 0
-    assert [first.actions_before(n) for n in range(19)] == [schedule.actions_before(n) for n in range(19)]
 
 
 @pytest.mark.parametrize("frozen", [True, False])
