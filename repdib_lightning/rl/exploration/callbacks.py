@@ -78,6 +78,13 @@ class Snapshots(Callback):
     def __init__(self) -> None:
         self._looked_at = 0
 
+    def on_load_checkpoint(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Put the data where they were: nobody else does where every update is done, but not yet the last actions."""
+        for state in checkpoint.get("exact_resume", {}).get("loaders", []):
+            _data_of(trainer).train_dataloader().load_state_dict(state)
+
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Refuse what cannot be: several processes, and snapshots before the quantiser has started."""
         if trainer.world_size > 1:
