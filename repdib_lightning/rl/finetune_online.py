@@ -34,6 +34,7 @@ def finetune_ddpg(
     noise: float = 0.2,
     noise_clip: float = 0.3,
     standardise: bool | None = None,
+    action_penalty: float = 0.0,
     update_every: int = 2,
     seed_frames: int = 4_000,
     shift: int | None = None,
@@ -82,6 +83,8 @@ def finetune_ddpg(
         noise_clip: where the latter's is clipped.
         standardise: whether actor and critics see features less their running mean, over their deviation; by default
             as the agent that is taken over did, else true.
+        action_penalty: weight of the squared actions in the actor's loss, which keep it from the bounds, where it has
+            no gradient.
         update_every: actions between two updates.
         seed_frames: before the first update; one episode at least.
         shift: largest random shift of the pictures of an encoder that is trained; 4 pixels by default.

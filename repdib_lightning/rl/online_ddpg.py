@@ -64,6 +64,7 @@ class DDPGTraining(OnlineTraining):
             noise=options.noise,
             noise_clip=options.noise_clip,
             standardise=self._standardise(),
+            penalty=options.action_penalty,
         )
         if loaded:
             self._load()

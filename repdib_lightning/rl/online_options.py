@@ -97,6 +97,7 @@ class DDPGOptions(OnlineOptions):
     noise: float
     noise_clip: float
     standardise: bool | None
+    action_penalty: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +130,7 @@ def check_online_options(options: OnlineOptions) -> None:
     for name in ("learning_rate", "value_limit"):
         if not 0.0 < getattr(options, name) < math.inf:
             raise UserError(f"--{name} must be above 0 and finite, is {getattr(options, name)}")
-    for name in ("noise", "noise_clip", "bottleneck_losses"):
+    for name in ("noise", "noise_clip", "action_penalty", "bottleneck_losses"):
         value = getattr(options, name, None)
         if value is not None and not 0.0 <= value < math.inf:
             raise UserError(f"--{name} must be finite and not negative, is {value}")

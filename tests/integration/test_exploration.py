@@ -93,28 +93,25 @@ def test_killed_and_resumed_is_as_if_nothing_had_been(whole, tmp_path, killed_af
     assert read_status(tmp_path / "run").state == "finished"
 
 
-def end_by(name, batches=0, children=False):
+def end_by(name, when, batches=0):
     return [
         *("--trainer.callbacks", "ending.EndBy", "--trainer.callbacks.name", name),
-        *("--trainer.callbacks.batches", str(batches), "--trainer.callbacks.children", str(children).lower()),
+        *("--trainer.callbacks.when", when, "--trainer.callbacks.batches", str(batches)),
     ]
 
 
 def test_killed_between_the_last_checkpoint_and_the_end_of_the_replay(whole, tmp_path):
-    assert command(tmp_path, *long(*end_by("SIGKILL"))) == -signal.SIGKILL
+    assert command(tmp_path, *long(*end_by("SIGKILL", "fit_end"))) == -signal.SIGKILL
     assert not (tmp_path / "run" / "replay.h5").exists()
     assert command(tmp_path, "fit", "--resume", "run", "--trainer.callbacks", "null") == 0
     equal(tmp_path / "run", whole)
 
 
-@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
-@pytest.mark.parametrize("children", [False, True])
-def test_asked_to_stop_with_workers_it_goes_on_without(whole, tmp_path, name, code, children):
-    processes = ["--data.processes", "true"]
-    found = command(tmp_path, *long(*processes, *end_by(name, 25, children)))
+@pytest.mark.parametrize(("name", "when", "code"), [("SIGTERM", "acting", 143), ("SIGINT", "batch", 130)])
+def test_asked_to_end_with_its_workers_it_goes_on_without_them(whole, tmp_path, name, when, code):
+    assert command(tmp_path, *long("--data.processes", "true", *end_by(name, when, 25))) == code
     output = (tmp_path / "output.txt").read_text()
-    assert found == code and "Traceback" not in output, output
-    if name == "SIGTERM":
-        assert last_good(tmp_path / "run").name == "step-00000025.ckpt"
+    assert "Traceback" not in output and "stopped: run    go on:" in output
+    assert last_good(tmp_path / "run").name == ("step-00000025.ckpt" if name == "SIGTERM" else "step-00000021.ckpt")
     assert command(tmp_path, "fit", "--resume", "run", "--trainer.callbacks", "null") == 0, output
     equal(tmp_path / "run", whole)

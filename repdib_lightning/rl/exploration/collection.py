@@ -22,6 +22,10 @@ Act = Callable[[dict[str, np.ndarray], np.ndarray], np.ndarray]
 _SEED_OF_EPISODES, _SEED_OF_ACTIONS = 0, 1
 
 
+class DeadWorker(UserError):
+    """A worker process does not answer."""
+
+
 @dataclass(frozen=True)
 class Schedule:
     """When environments are stepped, and when agents are updated; counts of actions of all environments together.
@@ -216,11 +220,12 @@ class Collection:
     def _send(self, actions: np.ndarray) -> None:
         for episode, action in zip(self._playing, actions, strict=True):
             episode.actions.append(action)
-        self._sent, self._pending = actions, True
+        self._sent = actions
         self.steps += len(actions)
         if self._processes:
             with _living_workers():
                 self._vector.step_async(actions)
+        self._pending = True
 
     def _receive(self) -> None:
         """Take what the last step gave, and put episodes that it ended into the replay."""
@@ -291,9 +296,9 @@ class Collection:
         """Close environments and replay, whatever has become of worker processes."""
         pending, self._pending = self._pending and self._processes, False
         try:
-            if pending:
-                self._vector.step_wait()
             if all(process.is_alive() for process in self._workers):
+                if pending:
+                    self._vector.step_wait()
                 self._vector.close()
         except (EOFError, ConnectionError, KeyboardInterrupt):  # they were killed, or interrupted as this process was
             pass
@@ -315,4 +320,4 @@ def _living_workers() -> Iterator[None]:
     try:
         yield
     except (EOFError, ConnectionError) as error:
-        raise UserError("a worker process that steps an environment has ended; was it killed?") from error
+        raise DeadWorker("a worker process that steps an environment has ended; was it killed?") from error

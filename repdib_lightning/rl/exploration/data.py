@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,19 +12,22 @@ from typing import Any
 import lightning.pytorch as pl
 import numpy as np
 import torch
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from repdib_lightning.data.schema import FactorSpec
 from repdib_lightning.environments.control_background import Kind as Distractors
 from repdib_lightning.environments.control_scene import Place, Quality
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import ActionSpec, ArraySpec, DataSpec
-from repdib_lightning.rl.exploration.collection import Act, Collection, Schedule
+from repdib_lightning.rl.exploration.collection import Act, Collection, DeadWorker, Schedule
 from repdib_lightning.rl.exploration.environment import ControlFactory
 from repdib_lightning.rl.exploration.replay import Replay, ReplayBatch, ReplayPlan
 
 VIEW = "pixels"
 REPLAY = "replay.h5"
 _EXAMPLE_ACTIONS = 8
+_LATE = 1.0
+"""Seconds that a signal to this process may come after those to its workers."""
 
 
 class ExplorationDataModule(pl.LightningDataModule):
@@ -256,6 +260,12 @@ class ExplorationDataModule(pl.LightningDataModule):
             replay.close()
             raise
 
+    def stop_if_asked(self) -> None:
+        """Raise SIGTERMException where this process was asked to end as its workers were: a scheduler asks them all."""
+        time.sleep(_LATE)
+        if self.trainer is not None and self.trainer.received_sigterm:
+            raise SIGTERMException
+
     def teardown(self, stage: str | None = None) -> None:
         """Take what actions are left, and publish the replay if the run is at its end."""
         if stage == "fit" and self._loader is not None:
@@ -295,9 +305,13 @@ class ExplorationLoader:
 
     def __iter__(self) -> Iterator[ReplayBatch]:
         """Yield what is left."""
-        collection = self._opened()
-        for number in collection.updates(self._data.act):
-            yield collection.replay.draw(number, self._data.batch_size)
+        try:
+            collection = self._opened()
+            for number in collection.updates(self._data.act):
+                yield collection.replay.draw(number, self._data.batch_size)
+        except DeadWorker:
+            self._data.stop_if_asked()
+            raise
 
     def _opened(self) -> Collection:
         if self.collection is None:

@@ -17,7 +17,7 @@ class DDPG(nn.Module):
     """An actor and twin critics on features (paper, table of continuous control; the losses are DrQ-v2's).
 
     - critic: (Q_i(s, a) - R_n - gamma^m min_j Q'_j(s', clip(pi(s') + e)))^2, summed over i;
-    - actor: - mean min_j Q_j(s, clip(pi(s) + e)), on detached features;
+    - actor: - mean min_j Q_j(s, clip(pi(s) + e)) + penalty mean pi(s)^2, on detached features;
     - e: normal with ``noise``, clipped at ``noise_clip``; the target critic follows at the rate tau.
 
     With ``standardise``, actor and critics see each feature less its running mean over its running deviation: frames of
@@ -29,6 +29,8 @@ class DDPG(nn.Module):
         tau: rate of the target critic. noise, noise_clip: of the actions; exploring actions are not clipped but to
             [-1, 1].
         standardise: see above; not in the published programs.
+        penalty: on large actions (as in Plappert et al. 2018, "Multi-Goal Reinforcement Learning"; 0 in the published
+            programs of URLB): an actor that is at the bounds has no gradient to come back by.
     """
 
     def __init__(
@@ -41,12 +43,13 @@ class DDPG(nn.Module):
         noise: float = 0.2,
         noise_clip: float = 0.3,
         standardise: bool = False,
+        penalty: float = 0.0,
     ) -> None:
         super().__init__()
         self.statistics = RunningStatistics(features) if standardise else None
         self.actor, self.critic = Actor(features, actions, hidden), TwinCritic(features, actions, hidden)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
-        self.tau, self.noise, self.noise_clip = tau, noise, noise_clip
+        self.tau, self.noise, self.noise_clip, self.penalty = tau, noise, noise_clip, penalty
 
     @torch.no_grad()
     def act(self, features: Tensor, noise: Tensor | None = None) -> Tensor:
@@ -88,8 +91,9 @@ class DDPG(nn.Module):
     def actor_loss(self, seen: Tensor) -> Tensor:
         """Scalar loss on features (B, M), which get no gradient."""
         seen = self.seen(seen.detach())
-        acted = noisy(self.actor(seen), self.noise, self.noise_clip)
-        return -smaller_value(self.critic, seen, acted).mean()
+        actions = self.actor(seen)
+        values = smaller_value(self.critic, seen, noisy(actions, self.noise, self.noise_clip))
+        return self.penalty * actions.square().mean() - values.mean()
 
     def follow(self) -> None:
         """Move the target critic by tau."""

@@ -51,6 +51,7 @@ class ExplorationModule(RepresentationModule):
         agent_learning_rate: Adam's, of actor and critics. tau: rate of the target critic.
         noise: deviation of the exploring noise, and of that in the losses, which is clipped at ``noise_clip``.
         standardise: whether actor and critics see latents less their mean, over their deviation.
+        action_penalty: weight of the squared actions in the actor's loss.
         reward_on: what is compared: the ``latent`` behind the bottleneck (paper: the discrete factorial embedding), the
             encoder's ``features`` before it, or its ``codes``, by the share of groups that differ.
         queue: what was seen that is remembered. neighbours: k, distance to the k-th nearest.
@@ -80,6 +81,7 @@ class ExplorationModule(RepresentationModule):
         noise: float = 0.2,
         noise_clip: float = 0.3,
         standardise: bool = False,
+        action_penalty: float = 0.0,
         reward_on: RewardOn = "latent",
         queue: int = 2048,
         neighbours: int = 3,
@@ -90,6 +92,7 @@ class ExplorationModule(RepresentationModule):
         self.automatic_optimization = False
         self.hidden, self.agent_learning_rate = hidden, agent_learning_rate
         self.tau, self.noise, self.noise_clip, self.standardise = tau, noise, noise_clip, standardise
+        self.action_penalty = action_penalty
         self.reward_on, self.queue, self.neighbours, self.duplicates = reward_on, queue, neighbours, duplicates
         self.value_limit = value_limit
         if reward_on not in REWARDS_ON:
@@ -99,7 +102,7 @@ class ExplorationModule(RepresentationModule):
                 raise UserError(f"model.{name} must be above 0, is {getattr(self, name)}")
         if self.tau > 1:
             raise UserError(f"model.tau must be at most 1, is {self.tau}")
-        for name in ("noise", "noise_clip"):
+        for name in ("noise", "noise_clip", "action_penalty"):
             if not getattr(self, name) >= 0:
                 raise UserError(f"model.{name} must not be negative, is {getattr(self, name)}")
 
@@ -118,6 +121,7 @@ class ExplorationModule(RepresentationModule):
             noise=self.noise,
             noise_clip=self.noise_clip,
             standardise=self.standardise,
+            penalty=self.action_penalty,
         )
         on_codes = self.reward_on == "codes"
         self.reward = NearestNeighbourReward(
