@@ -153,6 +153,8 @@ def _open(cli: TrainingCLI) -> None:
     resumed, configuration = cli.checkpoint is not None, cli.configuration()
     if isinstance(cli.datamodule, ExplorationDataModule):
         cli.datamodule.folder = cli.folder
+        if cli.trainer.num_devices * cli.trainer.num_nodes > 1:
+            raise UserError("trainer.devices: an exploration runs in one process; set trainer.devices to 1")
     run_folder.check_new(cli.folder, exist_ok=resumed)
     if resumed:
         check_idle(cli.folder)

@@ -126,12 +126,15 @@ LAYERS = [
     [HAMLET, "activities/smartwatch", "activities/statistics"],
     [MMACT, f"{MMACT}_repdib"],
     *([EXPLORATION, f"bottleneck/{name}"] for name in ("none", "vq")),
-    *([EXPLORATION, f"urlb/{domain}_repdib"] for domain in ("quadruped", "jaco")),
+    *([EXPLORATION, f"urlb/{domain}"] for domain in ("quadruped", "jaco")),
     *([PAPER_EXPLORATION, f"paper/urlb/{domain}"] for domain in ("quadruped", "jaco")),
 ]
 FEW_FRAMES = ["--data.frames", "5000", "--data.seed_frames", "1000", "--data.snapshots", "[]",
               "--data.action_repeat", "25", "--data.image_size", "32", "--data.processes", "false",
               "--data.environments", "2"]  # fmt: skip
+EXPLORED_AT_ONCE = ["--data.frames", "20500", "--data.snapshots", "[20000]", "--data.action_repeat", "125",
+                    "--data.image_size", "32", "--data.batch_size", "4", "--data.processes", "false",
+                    "--data.seed_frames", "19000"]  # fmt: skip
 ON_A_CPU = ["--trainer.accelerator", "cpu", "--trainer.precision", "32-true"]
 
 
@@ -225,11 +228,15 @@ def test_every_command_of_the_readme(here, monkeypatch):
             continue  # test_the_suite_of_the_readme, on fewer points
         if command[:2] == ["finetune", "dqn"]:
             small = ["--steps", "60", "--learning_starts", "30", "--evaluate_every", "30"]
+        elif command[:2] in (["finetune", "ddpg"], ["finetune", "sac"]):
+            small = ["--frames", "3000", "--seed_frames", "1000", "--batch_size", "4", "--episodes", "2"]
         elif command[0] == "finetune":
             small = ["--steps", "10", "--hidden", "32", "--batch_size", "16", "--episodes", "2"]
         if command[:2] == ["collect", "control"]:
             small = ["--samples", "500", "--workers", "1"]
-        if command[0] == "fit":
+        if "urlb/walker_repdib" in command:
+            small = [*EXPLORED_AT_ONCE, *QUANTISER_AT_ONCE]
+        elif command[0] == "fit":
             small = SMALL if "--resume" not in command else ["--trainer.max_steps", "4"]
             if not {"bottleneck/none", "activities/hamlet", "--resume"} & set(command):
                 small = [*small, *QUANTISER_AT_ONCE]

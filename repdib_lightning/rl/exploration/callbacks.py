@@ -60,6 +60,11 @@ class ExplorationProgress(Callback):
             for writer in tensorboards(trainer):
                 add_film(writer, "explore/episode", film_of(replay, self._counted - 1), step)
 
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """All updates are one epoch: stop after it, whatever ``trainer.max_epochs`` says."""
+        if trainer.global_step >= len(_data_of(trainer).train_dataloader()):
+            trainer.should_stop = True
+
     def _visit(self, replay: Replay, first: int) -> None:
         """Count the states of episodes that were not counted; all of them where a run goes on."""
         names = [name for name, spec in replay.plan.factors.items() if spec.kind == "endogenous"]
@@ -123,7 +128,7 @@ class Snapshots(Callback):
         if isinstance(exception, BrokenExploration):
             try:
                 folder = self._write(trainer, pl_module, _data_of(trainer).frames_done)
-                print(f"snapshot of what there was before: {folder}", file=sys.stderr)
+                print(f"snapshot of what there was before: {folder}", flush=True)
             except UserError as error:
                 print(f"warning: no snapshot: {error}", file=sys.stderr)
 

@@ -106,6 +106,8 @@ class ExplorationDataModule(pl.LightningDataModule):
         for name in ("seed_frames", "seed", "hold_out_every"):
             if getattr(self, name) < 0:
                 raise UserError(f"data.{name} must not be negative, is {getattr(self, name)}")
+        if self.seed >= 2**63:
+            raise UserError(f"data.seed must be below 2^63, is {self.seed}")
         if self.hold_out_every == 1:
             raise UserError(
                 "data.hold_out_every is 1: every episode would be held out; choose at least 2, or 0 for none"
@@ -220,7 +222,8 @@ class ExplorationDataModule(pl.LightningDataModule):
         """What the model that is trained does, (E, A)."""
         assert self.trainer is not None
         policy: Act = self.trainer.lightning_module.act  # type: ignore[assignment]
-        return policy(observations, noise)
+        with self.trainer.precision_plugin.forward_context():
+            return policy(observations, noise)
 
     @property
     def frames_done(self) -> int:

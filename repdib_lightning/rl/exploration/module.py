@@ -159,7 +159,7 @@ class ExplorationModule(RepresentationModule):
         with self._still():
             latents = self(seen).latent
             drawn = None if noise is None else torch.from_numpy(noise).to(self.device)
-            actions: np.ndarray = self.agent.act(latents, drawn).cpu().numpy()
+            actions: np.ndarray = self.agent.act(latents, drawn).float().cpu().numpy()
         return actions
 
     @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 from collections.abc import Mapping
@@ -94,15 +95,11 @@ def write_snapshot(
     Raises:
         UserError: as :func:`~repdib_lightning.export.bundle.save_bundle`.
     """
-    tensors = {name: value.detach().cpu().contiguous() for name, value in agent.state_dict().items()}
-    modes = encoder.training, bottleneck.training
-    try:
-        with whole_folder(folder) as aside:
-            save_bundle(aside, encoder.eval(), bottleneck.eval(), training=training, data=data, overwrite=True)
-            (aside / AGENT).write_bytes(as_bytes(tensors, {"agent": json.dumps(dict(facts))}))
-    finally:
-        encoder.train(modes[0])
-        bottleneck.train(modes[1])
+    tensors = {name: value.detach().float().cpu().contiguous() for name, value in agent.state_dict().items()}
+    parts = copy.deepcopy(encoder).float().eval(), copy.deepcopy(bottleneck).float().eval()
+    with whole_folder(folder) as aside:
+        save_bundle(aside, *parts, training=training, data=data, overwrite=True)
+        (aside / AGENT).write_bytes(as_bytes(tensors, {"agent": json.dumps(dict(facts))}))
     return folder
 
 
