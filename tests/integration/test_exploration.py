@@ -120,6 +120,7 @@ URLB = "URLB's: " + ", ".join(
     )
     for task in tasks
 )
+LATER = ["--data.seed_frames", "4100", "--data.frames", "6000", "--data.snapshots", "[]"]
 HALF, NONE = ["--data.hold_out_every", "2"], ["--config", "bottleneck/none"]
 
 
@@ -134,6 +135,7 @@ HALF, NONE = ["--data.hold_out_every", "2"], ["--config", "bottleneck/none"]
         (["--data.snapshots", "some"], "data.snapshots"),
         (["--data.batch_size", "41"], "data.batch_size is 41: at the first update there are 40 transitions"),
         ([*HALF, "--data.batch_size", "21"], "data.batch_size is 21: at the first update there are 20 transitions"),
+        ([*LATER, "--data.batch_size", "81"], "data.batch_size is 81: at the first update there are 80 transitions"),
         (["--data.hold_out_every", "1"], "data.hold_out_every is 1: every episode would be held out"),
         (["--data.hold_out_every", "-1"], "data.hold_out_every must not be negative"),
         (["--data.frames", "2000"], "data.frames is 2000: the first update comes after 2100 frames; choose more"),

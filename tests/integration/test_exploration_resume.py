@@ -102,6 +102,15 @@ def test_a_finished_run_stays_as_it_is(whole, tmp_path, monkeypatch):
     assert read_status(Path("run")).state == "finished"
 
 
+def test_a_finished_run_that_lost_its_last_checkpoint_goes_on_from_the_one_before(whole, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(whole, "run")
+    last = last_good(Path("run"))
+    last.write_bytes(last.read_bytes()[:-100])
+    assert main(["fit", "--resume", "run"]) == 0
+    equal(Path("run"), whole)
+
+
 def test_what_a_run_cannot_do_is_one_line(whole, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(whole, "run")

@@ -67,6 +67,11 @@ class Schedule:
         """Until the last action."""
         return max(0, self.total - self.seed) // self.update_every
 
+    @property
+    def episodes_at_first(self) -> int:
+        """Whole ones in the replay at the first update; the step under way is not in yet."""
+        return (math.ceil(self.seed / self.environments) - 1) // self.episode * self.environments
+
     def actions_before(self, update: int) -> int:
         """How many actions have been taken when an update (from 0 on) is due."""
         return self.seed + update * self.update_every

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+from repdib_lightning.data.partial import partial_of
 from repdib_lightning.data.schema import FactorSpec
 from repdib_lightning.environments.control_background import Kind as Distractors
 from repdib_lightning.environments.control_scene import Place, Quality
@@ -174,7 +175,7 @@ class ExplorationDataModule(pl.LightningDataModule):
                 raise UserError(
                     f"data.snapshots: {frames} is not between the first update ({first}) and the end ({last})"
                 )
-        drawn = self.environments if not self.hold_out_every else min(self.environments, self.hold_out_every - 1)
+        drawn = sum(not self.plan.is_held_out(episode) for episode in range(self.schedule.episodes_at_first))
         if self.batch_size > drawn * self.plan.steps:
             raise UserError(
                 f"data.batch_size is {self.batch_size}: at the first update there are {drawn * self.plan.steps} "
@@ -247,8 +248,11 @@ class ExplorationDataModule(pl.LightningDataModule):
         """Open environments and replay; going on after ``keep`` episodes."""
         assert self.folder is not None, "the run's folder is not known"
         os.environ.setdefault("LP_NUM_THREADS", "0")  # worker processes draw by themselves
+        path = self.folder / REPLAY
+        if keep is not None and path.exists():  # the run was finished, and has lost its last checkpoint since
+            os.replace(path, partial_of(path))
         replay = Replay(
-            self.folder / REPLAY,
+            path,
             self.plan,
             n_steps=self.n_steps,
             gamma=self.gamma,

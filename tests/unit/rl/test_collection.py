@@ -8,6 +8,7 @@ import signal
 import time
 import warnings
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -15,6 +16,7 @@ from small_worlds import collection, plan, policy, schedule
 from telling_world import ACTIONS, PICTURE, STEPS, Opener
 
 from repdib_lightning.data.episodes import EpisodeStore
+from repdib_lightning.data.schema import FactorSpec
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import ArraySpec
 from repdib_lightning.rl.exploration.collection import Collection, Schedule
@@ -84,17 +86,18 @@ def same(some, others):
 
 
 @pytest.mark.parametrize("environments", [1, 2, 3])
-@pytest.mark.parametrize("update_every", [1, 2, 5, 7])
-def test_updates_come_when_they_are_due_and_never_before_an_episode(tmp_path, environments, update_every):
-    when = schedule(environments, update_every=update_every)
+@pytest.mark.parametrize(("update_every", "seed_frames"), [(1, 0), (2, 20), (5, 21), (7, 23)])
+def test_updates_come_when_they_are_due_and_never_before_an_episode(tmp_path, environments, update_every, seed_frames):
+    when = schedule(environments, rounds=8, update_every=update_every, seed_frames=seed_frames)
     found, _ = whole(tmp_path / "x.h5", when)
     assert [number for number, *_ in found] == list(range(when.updates)) and found
+    assert found[0][2] == when.episodes_at_first
     for number, steps, episodes, _ in found:
         due = when.actions_before(number)
         assert due <= steps < due + environments and steps % environments == 0
         # the step under way is not in yet
         assert episodes == (steps - environments) // (environments * STEPS) * environments >= environments
-    assert len(EpisodeStore(tmp_path / "x.h5").lengths) == when.episodes == 4 * environments
+    assert len(EpisodeStore(tmp_path / "x.h5").lengths) == when.episodes == 8 * environments
 
 
 def slow_collection(when, seed, act):
@@ -327,19 +330,17 @@ def test_closing_waits_for_nothing_where_workers_were_killed_from_outside(tmp_pa
     assert collection(tmp_path / "x.h5", schedule(2), keep=2).replay.episodes == 2
 
 
-DOMAINS = ("walker-stand", "quadruped-walk", "jaco-reach_top_left")
-
-
-@pytest.mark.parametrize("task", DOMAINS)
-def test_bodies_repeat_themselves_in_a_new_process_amid_an_episode(tmp_path, task):
+@pytest.mark.parametrize(
+    ("task", "distractors"),
+    [("walker-stand", "none"), ("quadruped-walk", "none"), ("jaco-reach_top_left", "none"), ("walker-run", "video")],
+)
+def test_bodies_repeat_themselves_in_a_new_process_amid_an_episode(tmp_path, task, distractors):
     """What an environment went through before an episode leaves no trace in it."""
-    opener = ControlFactory(task, 16, 50, distractors="none")
+    opener = ControlFactory(task, 16, 50, distractors=distractors)
     opened = opener()
     steps = opened.task.steps
     sizes, shape = opened.task.sizes, opened.observation_space.shape
     opened.close()
-    from repdib_lightning.data.schema import FactorSpec
-
     factors = {name: FactorSpec("endogenous", "continuous", width=width) for name, width in sizes.items()}
     when = Schedule.of_frames(
         frames=150 * steps, action_repeat=50, episode=steps, environments=1, seed_frames=0, update_every=1
@@ -373,7 +374,6 @@ def test_bodies_repeat_themselves_in_a_new_process_amid_an_episode(tmp_path, tas
 
 def test_another_plan_of_observations_is_kept_by_name(tmp_path):
     """An environment that shows more than is kept."""
-    import gymnasium
 
     class Both(gymnasium.Wrapper):
         def __init__(self):

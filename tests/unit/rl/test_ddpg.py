@@ -195,3 +195,37 @@ def test_it_learns_to_do_what_is_paid_for():
     seen = torch.rand(500, 2) * 2 - 1
     assert (made.act(seen) - seen @ best).square().mean() < 0.02 < (seen @ best).square().mean() / 5
     assert made.values(seen).mean() == pytest.approx(1.0, abs=0.1)
+
+
+def test_standardised_features_are_those_of_a_slow_running_mean_and_deviation():
+    made, plain = agent(standardise=True), agent()
+    plain.load_state_dict({name: value for name, value in made.state_dict().items() if "statistics" not in name})
+    seen, later, *rest = batch()
+    torch.testing.assert_close(made.seen(seen), seen, rtol=1e-3, atol=1e-3)  # until anything is taken in
+    mean, variance = torch.zeros(WIDTH), torch.ones(WIDTH)
+    for seed in range(5):
+        drawn = 3 + 0.1 * torch.randn(BATCH, WIDTH, generator=torch.Generator().manual_seed(seed))
+        rate = 0.01 if seed else 1.0
+        mean = (1 - rate) * mean + rate * drawn.mean(0)
+        variance = (1 - rate) * variance + rate * drawn.var(0, correction=0)
+        torch.manual_seed(seed)
+        loss, value = made.critic_loss(drawn, later, *rest)
+        torch.manual_seed(seed)
+        pair = ((part - mean) / (variance + 1e-4).sqrt() for part in (drawn, later))
+        wanted = plain.critic_loss(*pair, *rest)
+        torch.testing.assert_close((loss, value), wanted, rtol=1e-4, atol=1e-5)
+    at = (seen - mean) / (variance + 1e-4).sqrt()
+    torch.testing.assert_close(made.seen(seen), at, rtol=1e-4, atol=1e-4)
+    for own, other in ((made.act(seen), plain.act(at)), (made.values(seen), plain.values(at))):
+        torch.testing.assert_close(own, other, rtol=1e-3, atol=1e-4)
+
+
+def test_only_what_the_critic_learns_from_moves_the_statistics():
+    made, (seen, later, *rest) = agent(standardise=True), batch()
+    made.critic_loss(seen, later, *rest)
+    before = copied(made.statistics)
+    made.act(later), made.values(later), made.actor_loss(later)
+    assert not any(moved(made.statistics, before))
+    made.critic_loss(later.requires_grad_(), seen, *rest)[0].backward()
+    assert later.grad.any() and all(moved(made.statistics, before)[:2])
+    assert not list(made.statistics.parameters()) and "statistics.mean" in made.state_dict()
