@@ -13,6 +13,8 @@ TINY = [
     *("--config", "urlb/walker_repdib", "--trainer.enable_progress_bar", "false", "--model.hidden", "16"),
     *("--model.encoder.init_args.features", "16", "--model.bottleneck.init_args.start_step", "3"),
     *("--model.bottleneck.init_args.groups", "4", "--model.bottleneck.init_args.codes", "6"),
+    *("--model.encoder.init_args.channels", "4", "--model.queue", "64"),
+    *("--model.objective.init_args.prototypes", "16", "--model.objective.init_args.hidden", "16"),
     *("--data.processes", "false", "--data.batch_size", "8", "--data.image_size", str(SIDE)),
     *("--data.seed_frames", "0", "--data.action_repeat", str(REPEAT)),
 ]

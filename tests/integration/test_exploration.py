@@ -153,7 +153,7 @@ HALF, NONE = ["--data.hold_out_every", "2"], ["--config", "bottleneck/none"]
         ([*NONE, "--model.reward_on", "codes"], "model.reward_on is codes: this bottleneck has none; choose latent or"),
         (["--model.reward_on", "latents"], "model.reward_on: unknown 'latents', did you mean 'latent'?"),
         (["--model.duplicates", "cuont"], "did you mean 'count'?"),
-        (["--model.neighbours", "3000"], "neighbours must be in 1..2048"),
+        (["--model.neighbours", "65"], "neighbours must be in 1..64"),
         (["--model.tau", "2"], "model.tau must be at most 1, is 2.0"),
         (["--model.loss_weights", "{prototype: 1.0}"], "no loss is called 'prototype' in this run, did you mean"),
         (["--trainer.devices", "2"], "trainer.devices: an exploration runs in one process; set trainer.devices to 1"),

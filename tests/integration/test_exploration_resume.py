@@ -19,7 +19,7 @@ from repdib_lightning.__main__ import main
 from repdib_lightning.callbacks import last_good, read_status
 from repdib_lightning.rl.exploration.snapshots import snapshots_of
 
-# Rounds of two episodes of 20 actions; 59 updates, before the 1st and after the 21st and 41st of which episodes end.
+# Rounds of two episodes of 20 actions; 39 updates, before the 1st and the 21st of which episodes end.
 LONG = [
     *("--checkpoint_every", "7", "--trainer.log_every_n_steps", "10", "--data.hold_out_every", "3"),
     *("--data.frame_stack", "2"),
@@ -27,7 +27,7 @@ LONG = [
 
 
 def long(*more):
-    return fit("run", 8000, "[3000,6000,8000]", *LONG, *more)
+    return fit("run", 6000, "[3000,5000,6000]", *LONG, *more)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_what_a_run_cannot_do_is_one_line(whole, tmp_path, monkeypatch, capsys):
     for verb in ("validate", "test"):
         assert f"{verb} run: an exploration has no held-out losses; export it" in complaint(capsys, verb, "run")
     changes = (
-        ("data.frames", "9000", "8000"),
+        ("data.frames", "9000", "6000"),
         ("data.task", "walker-run", "walker-stand"),
         ("model.hidden", "8", "16"),
     )

@@ -27,6 +27,8 @@ from repdib_lightning.rl.exploration.replay import ReplayBatch
 
 RewardOn = Literal["latent", "features", "codes"]
 REWARDS_ON = ("latent", "features", "codes")
+_AT_BOUNDS = 0.99
+"""Size of an action from which on its actor has next to no gradient."""
 
 
 class BrokenExploration(UserError):
@@ -200,6 +202,7 @@ class ExplorationModule(RepresentationModule):
         of_policy = self.agent.update_actor(seen, of_actor.optimizer)
         told |= {"critic_loss": of_values.detach(), "value": value, "actor_loss": of_policy}
         if written:
+            told["at_bounds"] = (self.agent.act(seen).abs() > _AT_BOUNDS).float().mean()
             self._log(named_values("train", loss, output, terms) | {f"explore/{name}": v for name, v in told.items()})
         return {"loss": loss.detach(), "terms": {name: value.detach() for name, value in output.losses.items()}}
 
