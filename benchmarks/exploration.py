@@ -17,8 +17,9 @@ import torch
 from benchmarks.measuring import alternate
 from benchmarks.reporting import claim, machine, table
 from repdib_lightning.environments.control_env import ControlEnv
-from repdib_lightning.rl.exploration.collection import Collection, Schedule
+from repdib_lightning.rl.exploration.collection import Collection
 from repdib_lightning.rl.exploration.replay import Replay, ReplayBatch
+from repdib_lightning.rl.exploration.schedule import Schedule
 
 CONFIGURATION = "urlb/walker_repdib"
 ACTIONS = 500

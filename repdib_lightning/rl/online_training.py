@@ -24,7 +24,7 @@ from repdib_lightning.export.frozen import FrozenEncoder
 from repdib_lightning.export.gymnasium_wrapper import PrepareObservation
 from repdib_lightning.rl.devices import check_device
 from repdib_lightning.rl.episodes_at_once import EpisodesAtOnce
-from repdib_lightning.rl.exploration.collection import Schedule
+from repdib_lightning.rl.exploration.schedule import Schedule
 from repdib_lightning.rl.film import side_by_side, write_film
 from repdib_lightning.rl.last_good import Spoiled, told
 from repdib_lightning.rl.offline_environment import CONTROL

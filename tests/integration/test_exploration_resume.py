@@ -88,7 +88,7 @@ def test_asked_to_end_with_its_workers_it_goes_on_without_them(whole, tmp_path, 
 
 
 def test_stopped_by_its_steps_it_goes_on_to_the_end(whole, tmp_path):
-    assert command(tmp_path, *long("--trainer.max_steps", "30")) == 0
+    assert command(tmp_path, *long("--trainer.max_steps", "15")) == 0
     assert list(snapshots_of(tmp_path / "run")) == [3000]
     assert command(tmp_path, "fit", "--resume", "run", "--trainer.max_steps", "-1") == 0
     equal(tmp_path / "run", whole)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
@@ -14,7 +12,9 @@ import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from repdib_lightning.errors import UserError
+from repdib_lightning.rl.exploration.episode import Episode
 from repdib_lightning.rl.exploration.replay import Replay, ReplayPlan
+from repdib_lightning.rl.exploration.schedule import Schedule
 
 Act = Callable[[dict[str, np.ndarray], np.ndarray], np.ndarray]
 """Observations name -> (E, *stacked shape) and standard normal noise (E, A), to actions (E, A)."""
@@ -24,89 +24,6 @@ _SEED_OF_EPISODES, _SEED_OF_ACTIONS = 0, 1
 
 class DeadWorker(UserError):
     """A worker process does not answer."""
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """When environments are stepped, and when agents are updated; counts of actions of all environments together.
-
-    Attributes:
-        environments: E, stepped together. episode: actions of one, T.
-        total: actions in all. seed: before the first update. update_every: between two updates.
-        random: of the first ones, which are drawn evenly; the policy is asked for all later ones.
-    """
-
-    environments: int
-    episode: int
-    total: int
-    seed: int
-    update_every: int
-    random: int
-
-    @classmethod
-    def of_frames(
-        cls, *, frames: int, action_repeat: int, episode: int, environments: int, seed_frames: int, update_every: int
-    ) -> Schedule:
-        """From counts of frames, each of which is a control step of an environment.
-
-        All environments play whole episodes, so that there may be more frames than asked for. No update comes before
-        the first episodes are in the replay.
-        """
-        together = environments * episode
-        total = math.ceil(frames / (together * action_repeat)) * together
-        seed = max(math.ceil(seed_frames / action_repeat), together + environments)
-        return cls(environments, episode, total, seed, update_every, seed)
-
-    @property
-    def episodes(self) -> int:
-        """Of all environments."""
-        return self.total // self.episode
-
-    @property
-    def updates(self) -> int:
-        """Until the last action."""
-        return max(0, self.total - self.seed) // self.update_every
-
-    @property
-    def episodes_at_first(self) -> int:
-        """Whole ones in the replay at the first update; the step under way is not in yet."""
-        return (math.ceil(self.seed / self.environments) - 1) // self.episode * self.environments
-
-    def actions_before(self, update: int) -> int:
-        """How many actions have been taken when an update (from 0 on) is due."""
-        return self.seed + update * self.update_every
-
-
-@dataclass
-class Episode:
-    """An episode that an environment is playing.
-
-    Attributes:
-        seed: of its beginning. frames: name -> (1, ...) rows of observations. actions, rewards, factors: so far.
-    """
-
-    seed: int
-    frames: dict[str, list[np.ndarray]]
-    factors: list[dict[str, np.ndarray]]
-    actions: list[np.ndarray] = field(default_factory=list)
-    rewards: list[float] = field(default_factory=list)
-
-    def stacked(self, name: str, stack: int) -> np.ndarray:
-        """(S * C, ...) of the newest frames; the first one is repeated where there are fewer."""
-        frames = self.frames[name]
-        places = range(len(frames) - stack, len(frames))
-        return frames[-1] if stack == 1 else np.concatenate([frames[max(place, 0)] for place in places])
-
-    def as_stored(self) -> dict[str, Any]:
-        """Arguments of :meth:`Replay.add`."""
-        names = self.factors[0]
-        factors = {name: np.stack([row[name] for row in self.factors]) for name in names}
-        return {
-            "observations": {name: np.stack(rows) for name, rows in self.frames.items()},
-            "actions": np.stack(self.actions),
-            "rewards": np.array(self.rewards, np.float32),
-            "factors": {name: values[:, 0] if values.shape[1:] == (1,) else values for name, values in factors.items()},
-        }
 
 
 class Collection:

@@ -10,8 +10,9 @@ from telling_world import ACTIONS, PICTURE, STEPS, Opener
 
 from repdib_lightning.data.schema import FactorSpec
 from repdib_lightning.records import ArraySpec
-from repdib_lightning.rl.exploration.collection import Collection, Schedule
+from repdib_lightning.rl.exploration.collection import Collection
 from repdib_lightning.rl.exploration.replay import Replay, ReplayPlan
+from repdib_lightning.rl.exploration.schedule import Schedule
 
 
 def plan(episodes: int, **options: Any) -> ReplayPlan:

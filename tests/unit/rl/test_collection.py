@@ -19,9 +19,10 @@ from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.schema import FactorSpec
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import ArraySpec
-from repdib_lightning.rl.exploration.collection import Collection, Schedule
+from repdib_lightning.rl.exploration.collection import Collection
 from repdib_lightning.rl.exploration.environment import ControlFactory
 from repdib_lightning.rl.exploration.replay import Replay, ReplayPlan
+from repdib_lightning.rl.exploration.schedule import Schedule
 
 BATCH = STEPS
 
