@@ -28,7 +28,7 @@ SHOULD = {"endogenous": "State kept (high is good)", "exogenous": "Noise kept (l
 
 
 def png(figure: Figure, dpi: int = 110) -> bytes:
-    """Draw a figure, small and opaque, in 256 colours where that is hardly seen; the same figure gives the same bytes."""
+    """Draw a figure, small and opaque; the same figure gives the same bytes."""
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=dpi)
     return small_png(Image.open(drawn))

@@ -53,7 +53,7 @@ def slow_values(critic, features, action):
     return [slow_network(network, [*features, *action])[0] for network in (critic.first, critic.second)]
 
 
-OPTIONS = [{}, {"noise": 0.0}, {"noise": 3.0, "noise_clip": 0.5}]
+OPTIONS = [{}, {"noise": 0.0}, {"noise": 3.0, "noise_clip": 0.5}, {"penalty": 0.7}]
 
 
 @pytest.mark.parametrize("options", OPTIONS)
@@ -81,8 +81,25 @@ def test_the_actor_s_loss_is_that_of_a_slow_loop(options):
     least = [
         min(slow_values(made.critic, row, slow_act(made, row, e))) for row, e in zip(seen.tolist(), noise, strict=True)
     ]
+    squares = [value**2 for row in seen.tolist() for value in slow_act(made, row)]
+    wanted = options.get("penalty", 0.0) * sum(squares) / len(squares) - sum(least) / BATCH
     torch.manual_seed(5)
-    assert float(made.actor_loss(seen).detach()) == pytest.approx(-sum(least) / BATCH, rel=1e-4)
+    assert float(made.actor_loss(seen).detach()) == pytest.approx(wanted, rel=1e-4)
+
+
+def test_a_penalty_brings_an_actor_back_from_its_bounds():
+    """Where no action is better than another one, it goes to 0; without the penalty it stays where it is."""
+    seen, ends = batch()[0], []
+    for penalty in (0.0, 1.0):
+        made = agent(penalty=penalty, noise=0.0)
+        for parameter in made.critic.parameters():
+            parameter.data.zero_()
+        made.actor.network[4].bias.data.fill_(2.0)
+        _, optimizer = made.build_optimizers(1e-2)
+        for _ in range(300):
+            made.update_actor(seen, optimizer)
+        ends.append(float(made.act(seen).abs().mean()))
+    assert ends[0] > 0.5 and ends[1] < 0.05
 
 
 def gradients(module):
