@@ -19,10 +19,10 @@ from repdib_lightning.__main__ import main
 from repdib_lightning.callbacks import last_good, read_status
 from repdib_lightning.rl.exploration.snapshots import snapshots_of
 
-# Rounds of two episodes of 20 actions; 39 updates, before the 1st and the 21st of which episodes end.
+# Rounds of two episodes of 10 actions; 38 updates, before the 1st and the 21st of which episodes end.
 LONG = [
     *("--checkpoint_every", "7", "--trainer.log_every_n_steps", "10", "--data.hold_out_every", "3"),
-    *("--data.frame_stack", "2"),
+    *("--data.frame_stack", "2", "--data.action_repeat", "100", "--data.update_every", "1"),
 ]
 
 
@@ -52,15 +52,24 @@ def equal(run, whole):
     assert all(torch.equal(final[key], wanted[key]) for key in wanted) and final.keys() == wanted.keys()
 
 
-@pytest.mark.parametrize("killed_after", [9, 25])
-def test_killed_and_resumed_is_as_if_nothing_had_been(whole, tmp_path, killed_after):
-    kill = ["--trainer.callbacks", "killing.KillAfter", "--trainer.callbacks.batches", str(killed_after)]
-    assert command(tmp_path, *long(*kill)) == -signal.SIGKILL, (tmp_path / "output.txt").read_text()
-    assert not (tmp_path / "run" / "replay.h5").exists()
-    code = command(tmp_path, "fit", "--resume", "run", "--trainer.callbacks", "null")
-    assert code == 0, (tmp_path / "output.txt").read_text()
-    equal(tmp_path / "run", whole)
-    assert read_status(tmp_path / "run").state == "finished"
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def go_on():
+    assert main(["fit", "--resume", "run", "--trainer.callbacks", "null", "--trainer.max_steps", "-1"]) == 0
+    assert read_status(Path("run")).state == "finished"
+
+
+def test_killed_in_mid_episode_it_goes_on_as_if_nothing_had_been(whole, here):
+    """Logs are written at steps 19 and 29, a checkpoint after 21, when episodes have just ended."""
+    kill = ["--trainer.callbacks", "killing.KillAfter", "--trainer.callbacks.batches", "25"]
+    assert command(here, *long(*kill)) == -signal.SIGKILL, Path("output.txt").read_text()
+    assert not Path("run/replay.h5").exists() and last_good(Path("run")).name == "step-00000021.ckpt"
+    go_on()
+    equal(Path("run"), whole)
 
 
 def end_by(name, when, batches=0):
@@ -70,49 +79,45 @@ def end_by(name, when, batches=0):
     ]
 
 
-def test_killed_between_the_last_checkpoint_and_the_end_of_the_replay(whole, tmp_path):
-    assert command(tmp_path, *long(*end_by("SIGKILL", "fit_end"))) == -signal.SIGKILL
-    assert not (tmp_path / "run" / "replay.h5").exists()
-    assert command(tmp_path, "fit", "--resume", "run", "--trainer.callbacks", "null") == 0
-    equal(tmp_path / "run", whole)
+def test_killed_between_the_last_checkpoint_and_the_end_of_the_replay(whole, here):
+    assert command(here, *long(*end_by("SIGKILL", "fit_end"))) == -signal.SIGKILL, Path("output.txt").read_text()
+    assert not Path("run/replay.h5").exists()
+    go_on()
+    equal(Path("run"), whole)
 
 
 @pytest.mark.parametrize(("name", "when", "code"), [("SIGTERM", "acting", 143), ("SIGINT", "batch", 130)])
-def test_asked_to_end_with_its_workers_it_goes_on_without_them(whole, tmp_path, name, when, code):
-    assert command(tmp_path, *long("--data.processes", "true", *end_by(name, when, 25))) == code
-    output = (tmp_path / "output.txt").read_text()
-    assert "Traceback" not in output and "stopped: run    go on:" in output
-    assert last_good(tmp_path / "run").name == ("step-00000025.ckpt" if name == "SIGTERM" else "step-00000021.ckpt")
-    assert command(tmp_path, "fit", "--resume", "run", "--trainer.callbacks", "null") == 0, output
-    equal(tmp_path / "run", whole)
-
-
-def test_stopped_by_its_steps_it_goes_on_to_the_end(whole, tmp_path):
-    assert command(tmp_path, *long("--trainer.max_steps", "15")) == 0
-    assert list(snapshots_of(tmp_path / "run")) == [3000]
-    assert command(tmp_path, "fit", "--resume", "run", "--trainer.max_steps", "-1") == 0
-    equal(tmp_path / "run", whole)
-
-
-def test_a_finished_run_stays_as_it_is(whole, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(whole, "run")
-    assert main(["fit", "--resume", "run"]) == 0
+def test_asked_to_end_with_its_workers_it_goes_on_with_new_ones(whole, here, name, when, code):
+    found = command(here, *long("--data.processes", "true", *end_by(name, when, 25)))
+    output = Path("output.txt").read_text()
+    assert found == code and "Traceback" not in output and "stopped: run    go on:" in output, output
+    assert last_good(Path("run")).name == ("step-00000025.ckpt" if name == "SIGTERM" else "step-00000021.ckpt")
+    go_on()
     equal(Path("run"), whole)
-    assert read_status(Path("run")).state == "finished"
 
 
-def test_a_finished_run_that_lost_its_last_checkpoint_goes_on_from_the_one_before(whole, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_stopped_by_its_steps_it_goes_on_to_the_end(whole, here):
+    assert main(long("--trainer.max_steps", "15")) == 0
+    assert list(snapshots_of(Path("run"))) == [3000]
+    go_on()
+    equal(Path("run"), whole)
+
+
+def test_a_finished_run_stays_as_it_is(whole, here):
+    shutil.copytree(whole, "run")
+    go_on()
+    equal(Path("run"), whole)
+
+
+def test_a_finished_run_that_lost_its_last_checkpoint_goes_on_from_the_one_before(whole, here):
     shutil.copytree(whole, "run")
     last = last_good(Path("run"))
     last.write_bytes(last.read_bytes()[:-100])
-    assert main(["fit", "--resume", "run"]) == 0
+    go_on()
     equal(Path("run"), whole)
 
 
-def test_what_a_run_cannot_do_is_one_line(whole, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_what_a_run_cannot_do_is_one_line(whole, here, capsys):
     shutil.copytree(whole, "run")
     for verb in ("validate", "test"):
         assert f"{verb} run: an exploration has no held-out losses; export it" in complaint(capsys, verb, "run")
