@@ -163,7 +163,7 @@ def collected(data: Any, count: int, processes: bool) -> tuple[float, float]:
 
 def seconds_used(collection: Collection) -> float:
     """Processor time of this process and of those of the environments, so far."""
-    workers = [process.pid for process in getattr(collection._vector, "processes", [])]
+    workers = [process.pid for process in getattr(collection._environments, "processes", [])]
     ticks = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13] for pid in [os.getpid(), *workers]]
     return sum(int(tick) for pair in ticks for tick in pair) / os.sysconf("SC_CLK_TCK")
 

@@ -41,4 +41,4 @@ class EndBy(Callback):
             children = [int(child) for child in file.read().split()]
         for process in (*children, os.getpid()):
             os.kill(process, self.signal)
-        time.sleep(0.5)  # until the children are gone
+        time.sleep(0.5)  # until a child that dies of it is gone

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from repdib_lightning.errors import UserError
 from repdib_lightning.rl.exploration.episode import Episode
 from repdib_lightning.rl.exploration.replay import Replay, ReplayPlan
 from repdib_lightning.rl.exploration.schedule import Schedule
+from repdib_lightning.rl.exploration.stepping import Moved, Opener, stepper
 
 Act = Callable[[dict[str, np.ndarray], np.ndarray], np.ndarray]
 """Observations name -> (E, *stacked shape) and standard normal noise (E, A), to actions (E, A)."""
 
 _SEED_OF_EPISODES, _SEED_OF_ACTIONS = 0, 1
-
-
-class DeadWorker(UserError):
-    """A worker process does not answer."""
 
 
 class Collection:
@@ -40,7 +34,7 @@ class Collection:
         replay: its plan has the observations that are kept.
         schedule: see there.
         seed: of all episodes and random actions.
-        processes: True for a worker process an environment.
+        processes: True for worker processes, as many as there are cores.
 
     Attributes:
         returns: sum of the rewards of each episode that has ended since they were last taken.
@@ -51,7 +45,7 @@ class Collection:
 
     def __init__(
         self,
-        environments: Sequence[Callable[[], gymnasium.Env[Any, Any]]],
+        environments: Sequence[Opener],
         replay: Replay,
         schedule: Schedule,
         *,
@@ -59,16 +53,9 @@ class Collection:
         processes: bool = False,
     ) -> None:
         self.replay, self.schedule, self.seed = replay, schedule, seed
-        manual: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED, "copy": True}
-        self._processes, self._pending = processes, False
-        with _living_workers():
-            self._vector: Any = (
-                AsyncVectorEnv(environments, context="spawn", **manual)
-                if processes
-                else SyncVectorEnv(environments, **manual)
-            )
+        self._environments = stepper(environments, processes)
+        self._pending = False
         self._playing: list[Episode] = []
-        self._sent = np.zeros(0)
         self.steps = self.updates_done = 0
         self.returns: list[float] = []
 
@@ -131,22 +118,16 @@ class Collection:
             key = self._key(_SEED_OF_EPISODES, self.steps)
             drawn = np.random.Generator(np.random.Philox(key=key)).integers(2**31, size=self.schedule.environments)
             seeds = [int(seed) for seed in drawn]
-        with _living_workers():
-            shown, info = self._vector.reset(seed=list(seeds))
-        frames, factors = self._rows(shown), self._factors(info)
         self._playing = [
-            Episode(seed, {name: [rows[i]] for name, rows in frames.items()}, [factors[i]])
-            for i, seed in enumerate(seeds)
+            Episode(seed, {name: [row] for name, row in self._rows(begun).items()}, [self._factors(begun)])
+            for seed, begun in zip(seeds, self._environments.reset(seeds), strict=True)
         ]
 
     def _send(self, actions: np.ndarray) -> None:
         for episode, action in zip(self._playing, actions, strict=True):
             episode.actions.append(action)
-        self._sent = actions
         self.steps += len(actions)
-        if self._processes:
-            with _living_workers():
-                self._vector.step_async(actions)
+        self._environments.send(actions)
         self._pending = True
 
     def _receive(self) -> None:
@@ -154,21 +135,18 @@ class Collection:
         if not self._pending:
             return
         self._pending = False
-        with _living_workers():
-            moved = self._vector.step_wait() if self._processes else self._vector.step(self._sent)
-        shown, rewards, terminated, truncated, info = moved
-        frames, factors = self._rows(shown), self._factors(info)
-        for i, episode in enumerate(self._playing):
-            for name, rows in frames.items():
-                episode.frames[name].append(rows[i])
-            episode.factors.append(factors[i])
-            episode.rewards.append(float(rewards[i]))
-        if len(self._playing[0].actions) == self.plan.steps or (terminated | truncated).any():
-            self._end(terminated, truncated)
+        moved = self._environments.receive()
+        for episode, after in zip(self._playing, moved, strict=True):
+            for name, row in self._rows(after).items():
+                episode.frames[name].append(row)
+            episode.factors.append(self._factors(after))
+            episode.rewards.append(after.reward)
+        if len(self._playing[0].actions) == self.plan.steps or any(m.terminated or m.truncated for m in moved):
+            self._end(moved)
 
-    def _end(self, terminated: np.ndarray, truncated: np.ndarray) -> None:
+    def _end(self, moved: Sequence[Moved]) -> None:
         length, planned = len(self._playing[0].actions), self.plan.steps
-        if terminated.any() or not truncated.all() or length != planned:
+        if any(m.terminated or not m.truncated for m in moved) or length != planned:
             raise UserError(
                 f"an episode ended after {length} actions, all are planned to be cut off after {planned}; choose a "
                 "task whose episodes end by their time limit alone"
@@ -178,13 +156,12 @@ class Collection:
             self.returns.append(float(np.sum(episode.rewards)))
         self._playing = []
 
-    def _rows(self, shown: Any) -> dict[str, np.ndarray]:
+    def _rows(self, moved: Moved) -> dict[str, np.ndarray]:
         names = list(self.plan.observations)
-        return {name: shown[name] for name in names} if isinstance(shown, dict) else {names[0]: shown}
+        return {name: moved.shown[name] for name in names} if isinstance(moved.shown, dict) else {names[0]: moved.shown}
 
-    def _factors(self, info: dict[str, Any]) -> list[dict[str, np.ndarray]]:
-        told = info.get("factors", {})
-        return [{name: told[name][i] for name in self.plan.factors} for i in range(self.schedule.environments)]
+    def _factors(self, moved: Moved) -> dict[str, np.ndarray]:
+        return {name: moved.factors[name] for name in self.plan.factors}
 
     def state_dict(self) -> dict[str, Any]:
         """Counts, and seeds and actions of the episodes under way."""
@@ -216,30 +193,7 @@ class Collection:
 
     def close(self) -> None:
         """Close environments and replay, whatever has become of worker processes."""
-        pending, self._pending = self._pending and self._processes, False
         try:
-            if all(process.is_alive() for process in self._workers):
-                if pending:
-                    self._vector.step_wait()
-                self._vector.close()
-        except (EOFError, ConnectionError, KeyboardInterrupt):  # they were killed, or interrupted as this process was
-            pass
+            self._environments.close()
         finally:
-            for process in self._workers:
-                process.terminate()
-                process.join()
-            self._vector.closed = True
             self.replay.close()
-
-    @property
-    def _workers(self) -> list[Any]:
-        return self._vector.processes if self._processes else []
-
-
-@contextmanager
-def _living_workers() -> Iterator[None]:
-    """Say so where a worker process does not answer."""
-    try:
-        yield
-    except (EOFError, ConnectionError) as error:
-        raise DeadWorker("a worker process that steps an environment has ended; was it killed?") from error

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import copy
 import os
-import time
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
 import numpy as np
 import torch
-from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from repdib_lightning.data.partial import partial_of
 from repdib_lightning.data.schema import FactorSpec
@@ -27,8 +25,6 @@ from repdib_lightning.rl.exploration.schedule import Schedule
 
 VIEW = "pixels"
 _EXAMPLE_ACTIONS = 8
-_LATE = 1.0
-"""Seconds that a signal to this process may come after those to its workers."""
 
 
 class ExplorationDataModule(pl.LightningDataModule):
@@ -44,8 +40,8 @@ class ExplorationDataModule(pl.LightningDataModule):
         snapshots: frames after which encoder and agent are kept for fine-tuning.
         batch_size: transitions an update. frame_stack: S. image_size: height of the pictures in pixels.
         action_repeat: control steps an action is held for.
-        environments: stepped together. processes: whether each has a worker process, so that they step while the model
-            is updated.
+        environments: stepped together. processes: whether they have worker processes, as many as there are cores, so
+            that they take their step while the model is updated.
         seed_frames: of random actions before the first update, at least an episode of each environment.
         update_every: actions between two updates.
         n_steps: between the two observations of a transition. gamma: discount.
@@ -266,12 +262,6 @@ class ExplorationDataModule(pl.LightningDataModule):
         except BaseException:
             replay.close()
             raise
-
-    def stop_if_asked(self) -> None:
-        """Raise SIGTERMException where this process was asked to end as its workers were: a scheduler asks them all."""
-        time.sleep(_LATE)
-        if self.trainer is not None and self.trainer.received_sigterm:
-            raise SIGTERMException
 
     def teardown(self, stage: str | None = None) -> None:
         """Take what actions are left, and publish the replay if the run is at its end."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from typing import Any
 
 from repdib_lightning.environments.control_env import ControlEnv
@@ -13,19 +11,14 @@ from repdib_lightning.environments.rendering import prepare_rendering
 class ControlFactory:
     """Opens environments of the Control Suite that are alike; pickles, so that worker processes open their own.
 
-    A worker process is deaf to Ctrl-C, which reaches it too: who it works for ends it.
-
     Args:
         task, image_size, action_repeat, scene: of :class:`~repdib_lightning.environments.control_env.ControlEnv`.
     """
 
     def __init__(self, task: str, image_size: int, action_repeat: int, **scene: Any) -> None:
-        self._process = os.getpid()
         self._options = {"task": task, "image_size": image_size, "action_repeat": action_repeat, **scene}
 
     def __call__(self) -> ControlEnv:
         """Open one, which draws in its own thread."""
-        if os.getpid() != self._process:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
         prepare_rendering(threads=0)
         return ControlEnv(**self._options)

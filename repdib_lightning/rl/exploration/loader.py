@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from repdib_lightning.rl.exploration.collection import Collection, DeadWorker
+from repdib_lightning.rl.exploration.collection import Collection
 from repdib_lightning.rl.exploration.replay import ReplayBatch
 
 if TYPE_CHECKING:
@@ -45,13 +45,9 @@ class ExplorationLoader:
 
     def __iter__(self) -> Iterator[ReplayBatch]:
         """Yield what is left."""
-        try:
-            collection = self._opened()
-            for number in collection.updates(self._data.act):
-                yield collection.replay.draw(number, self._data.batch_size)
-        except DeadWorker:
-            self._data.stop_if_asked()
-            raise
+        collection = self._opened()
+        for number in collection.updates(self._data.act):
+            yield collection.replay.draw(number, self._data.batch_size)
 
     def _opened(self) -> Collection:
         if self.collection is None:

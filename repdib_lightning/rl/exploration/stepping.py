@@ -1,13 +1,13 @@
 """Several environments stepped together, in this process or in worker processes, each of which has several of them.
 
-gymnasium's vector environments have a process an environment: with steps of under a millisecond they wait for each other
-most of the time.
+gymnasium's have a process an environment, which with steps of under a millisecond wait for each other most of the time.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class Together:
 
     def __init__(self, openers: Sequence[Opener]) -> None:
         self._environments = [opener() for opener in openers]
-        self._actions: Sequence[np.ndarray] = ()
+        self._actions = np.zeros((0, 0))
 
     def reset(self, seeds: Sequence[int]) -> list[Moved]:
         """Begin an episode in each."""
@@ -175,11 +175,20 @@ def _serve(connection: Connection, openers: Sequence[Opener]) -> None:
                 connection.send(together.receive())
     except (EOFError, ConnectionError):
         pass
-    except Exception as error:  # of whatever an environment raises
-        connection.send(error)
+    except Exception as error:  # whatever an environment raises
+        connection.send(_sendable(error))
     finally:
         if together is not None:
             together.close()
+
+
+def _sendable(error: Exception) -> Exception:
+    """The error, or its text where it cannot go through a pipe."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:  # its constructor wants something else than its arguments
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
 
 
 def _kept(shown: Any) -> Any:
