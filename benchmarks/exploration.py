@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
-import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from benchmarks.measuring import alternate
 from benchmarks.reporting import claim, machine, table
 from repdib_lightning.environments.control_env import ControlEnv
-from repdib_lightning.rl.exploration.collection import Collection
-from repdib_lightning.rl.exploration.replay import Replay, ReplayBatch
-from repdib_lightning.rl.exploration.schedule import Schedule
+from repdib_lightning.rl.exploration.replay import ReplayBatch
+from repdib_lightning.rl.exploration.stepping import Apart, Together
 
 CONFIGURATION = "urlb/walker_repdib"
-ACTIONS = 500
+ACTIONS = 450
+"""Of each environment; fewer than an episode has."""
+
+ONE = "1 in this process"
+REPEATS = 50
+"""Calls of what takes little."""
 
 
 def main() -> None:
@@ -74,11 +78,16 @@ def parts_of(data: Any, module: Any) -> dict[str, Callable[[], object]]:
             environment.reset()
 
     return {
-        "stepping": step,
-        "rendering": lambda: environment.camera.see(environment.task),
-        "acting": lambda: module.act(shown, noise),
+        "stepping": repeated(step),
+        "rendering": repeated(lambda: environment.camera.see(environment.task)),
+        "acting": repeated(lambda: module.act(shown, noise)),
         "updating": lambda: module.training_step(batch, 0),
     }
+
+
+def repeated(call: Callable[[], object]) -> Callable[[], object]:
+    """Many calls, since one alone begins with cold caches."""
+    return lambda: [call() for _ in range(REPEATS)]
 
 
 def batch_of(data: Any, module: Any, random: np.random.Generator) -> ReplayBatch:
@@ -103,9 +112,9 @@ def batch_of(data: Any, module: Any, random: np.random.Generator) -> ReplayBatch
 def shares(took: Any, data: Any) -> None:
     """How much of an action's time each part takes, without overlap."""
     each = {
-        "stepping the simulator": took["stepping"],
-        "rendering": took["rendering"],
-        "acting (encoder and actor, all environments at once)": took["acting"] / data.environments,
+        "stepping the simulator": took["stepping"] / REPEATS,
+        "rendering": took["rendering"] / REPEATS,
+        "acting (encoder and actor, all environments at once)": took["acting"] / REPEATS / data.environments,
         f"updating (every {data.update_every} actions)": took["updating"] / data.update_every,
     }
     whole = sum(each.values())
@@ -118,52 +127,82 @@ def shares(took: Any, data: Any) -> None:
 
 
 def collections(data: Any, rounds: int) -> None:
-    """Random actions by several environments, in this process and in processes of their own."""
+    """Random actions by several environments at once, in several ways."""
     cores = len(os.sched_getaffinity(0))
-    rates: dict[str, list[float]] = {}
-    busy: dict[str, list[float]] = {}
-    kinds = {"1 in this process": (1, False), "2 in this process": (2, False)}
-    kinds |= {f"{count} in {count} processes": (count, True) for count in (2, 4)}
-    for _ in range(rounds):
-        for name, (count, processes) in kinds.items():
-            rate, share = collected(data, count, processes)
-            rates.setdefault(name, []).append(rate)
-            busy.setdefault(name, []).append(share)
-    middle = {name: float(np.median(values)) for name, values in rates.items()}
-    rows = [
-        [name, middle[name], middle[name] / middle["1 in this process"], f"{100 * np.median(busy[name]):.0f} %"]
-        for name in kinds
-    ]
-    print(f"Collecting alone, with random actions, {cores} cores:\n")
+    opener = data.environment
+    kinds: dict[str, Callable[[], tuple[float, float]]] = {
+        ONE: lambda: stepped(Together([opener]), 1),
+        f"8 in {cores} workers": lambda: stepped(Apart([opener] * 8, cores), 8),
+        f"{cores} in {cores} workers": lambda: stepped(Apart([opener] * cores, cores), cores),
+        "8, gymnasium's AsyncVectorEnv": lambda: stepped(Gymnasium([opener] * 8), 8),
+        f"{cores}, gymnasium's AsyncVectorEnv": lambda: stepped(Gymnasium([opener] * cores), cores),
+        f"limit: {cores} processes that never wait for each other": lambda: independent(opener, cores),
+    }
+    found = {name: [measure() for _ in range(rounds)] for name, measure in kinds.items()}
+    rate = {name: float(np.median([speed for speed, _ in values])) for name, values in found.items()}
+    busy = {name: float(np.median([share for _, share in values])) for name, values in found.items()}
+    rows = [[name, rate[name], rate[name] / rate[ONE], f"{100 * busy[name]:.0f} %"] for name in kinds]
+    print(f"Collecting alone, with random actions, {cores} cores; a step waits for all environments:\n")
     print(table(["environments", "actions a s", "1 in this process = 1", "of all cores busy"], rows) + "\n")
-    best = max(name for name in kinds if "processes" in name)
-    print(claim(f"{best}, relative to 1 in this process", middle[best] / middle["1 in this process"], at_least=1.5))
-    print(claim(f"cores busy with {best}, share", float(np.median(busy[best])), at_least=0.85))
+    ours, theirs = f"8 in {cores} workers", "8, gymnasium's AsyncVectorEnv"
+    print(claim("8 in workers, relative to gymnasium's AsyncVectorEnv", rate[ours] / rate[theirs], at_least=1.2))
+    print(claim("cores busy with 8 in workers, share", busy[ours], at_least=0.85))
 
 
-def collected(data: Any, count: int, processes: bool) -> tuple[float, float]:
+class Gymnasium:
+    """gymnasium's vector environment, a process an environment, stepped as ours are."""
+
+    def __init__(self, openers: list[Any]) -> None:
+        self._vector = AsyncVectorEnv(openers, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+        self.processes = self._vector.processes
+
+    def reset(self, seeds: list[int]) -> None:
+        """Begin."""
+        self._vector.reset(seed=seeds)
+
+    def send(self, actions: np.ndarray) -> None:
+        """Ask for a step."""
+        self._vector.step_async(actions)
+
+    def receive(self) -> None:
+        """Wait for it."""
+        self._vector.step_wait()
+
+    def close(self) -> None:
+        """Close."""
+        self._vector.close()
+
+
+def stepped(environments: Any, count: int) -> tuple[float, float]:
     """Actions a second, start-up left out, and the share of all cores' time that was used."""
-    schedule = Schedule(count, data.plan.steps, ACTIONS * count, 0, ACTIONS * count, 0)
-    plan = replace(data.plan, episodes=schedule.episodes)
-    with tempfile.TemporaryDirectory() as folder:
-        replay = Replay(Path(folder) / "replay.h5", plan, seed=0)
-        collection = Collection([data.environment] * count, replay, schedule, seed=0, processes=processes)
-        random = np.random.default_rng(0)
-
-        def act(observations: object, noise: np.ndarray) -> np.ndarray:
-            return random.uniform(-1.0, 1.0, noise.shape).astype(np.float32)
-
-        used, began = seconds_used(collection), time.perf_counter()
-        collection.finish(act)
-        took = time.perf_counter() - began
-        used = seconds_used(collection) - used
-        collection.close()
-    return schedule.total / took, used / took / len(os.sched_getaffinity(0))
+    random = np.random.default_rng(0)
+    environments.reset(list(range(count)))
+    used, began = seconds_used(environments), time.perf_counter()
+    for _ in range(ACTIONS):
+        environments.send(random.uniform(-1.0, 1.0, (count, 6)).astype(np.float32))
+        environments.receive()
+    took = time.perf_counter() - began
+    used = seconds_used(environments) - used
+    environments.close()
+    return ACTIONS * count / took, used / took / len(os.sched_getaffinity(0))
 
 
-def seconds_used(collection: Collection) -> float:
+def independent(opener: Any, count: int) -> tuple[float, float]:
+    """The same by processes each of which steps its own."""
+    with multiprocessing.get_context("spawn").Pool(count) as pool:
+        pool.map(int, range(count), 1)
+        found = pool.starmap(alone, [(opener,)] * count, 1)
+    return sum(speed for speed, _ in found), sum(share for _, share in found)
+
+
+def alone(opener: Any) -> tuple[float, float]:
+    """One environment in this process."""
+    return stepped(Together([opener]), 1)
+
+
+def seconds_used(environments: Any) -> float:
     """Processor time of this process and of those of the environments, so far."""
-    workers = [process.pid for process in getattr(collection._environments, "processes", [])]
+    workers = [process.pid for process in getattr(environments, "processes", [])]
     ticks = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13] for pid in [os.getpid(), *workers]]
     return sum(int(tick) for pair in ticks for tick in pair) / os.sysconf("SC_CLK_TCK")
 
