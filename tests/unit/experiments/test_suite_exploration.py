@@ -342,7 +342,7 @@ def test_a_column_that_is_seldom_logged_is_drawn_where_it_was(results):
 
 
 def drawn(content):
-    return np.asarray(Image.open(io.BytesIO(content)))
+    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))
 
 
 def band(*values):
