@@ -13,7 +13,7 @@ from repdib_lightning.callbacks import read_status
 from repdib_lightning.errors import UserError
 
 _FIXED = ("seed_everything", "model", "data")
-_FREE = ("data.init_args.path", "data.init_args.workers", "data.init_args.resident")
+_FREE = tuple(f"data.init_args.{name}" for name in ("path", "workers", "resident", "processes"))
 
 
 def check_idle(folder: Path) -> None:

@@ -38,7 +38,7 @@ class ExplorationDataModule(pl.LightningDataModule):
         task: such as ``walker-stand``; URLB explores walker-stand, quadruped-walk and jaco-reach_top_left.
         frames: in all; rounded up to whole episodes of all environments.
         snapshots: frames after which encoder and agent are kept for fine-tuning.
-        batch_size: transitions an update. frame_stack: S. image_size: height of the pictures in pixels.
+        batch_size: transitions an update (paper: 1024). frame_stack: S. image_size: height of the pictures in pixels.
         action_repeat: control steps an action is held for.
         environments: stepped together. processes: whether they have worker processes, as many as there are cores, so
             that they take their step while the model is updated.
@@ -59,7 +59,7 @@ class ExplorationDataModule(pl.LightningDataModule):
         task: str = "walker-stand",
         frames: int = 2_000_000,
         snapshots: list[int] | None = None,
-        batch_size: int = 1024,
+        batch_size: int = 256,
         frame_stack: int = 3,
         image_size: int = 84,
         action_repeat: int = 2,
