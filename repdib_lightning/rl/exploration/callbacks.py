@@ -91,9 +91,7 @@ class Snapshots(Callback):
             _data_of(trainer).train_dataloader().load_state_dict(state)
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Refuse what cannot be: several processes, and snapshots before the quantiser has started."""
-        if trainer.world_size > 1:
-            raise UserError("trainer.devices: an exploration runs in one process; set trainer.devices to 1")
+        """Refuse snapshots before the quantiser has started."""
         data = _data_of(trainer)
         self._looked_at = data.frames_done
         starts = [module.start_step for module in pl_module.modules() if isinstance(module, VectorQuantiser)]

@@ -56,6 +56,9 @@ class Collection:
         self._environments = stepper(environments, processes)
         self._pending = False
         self._playing: list[Episode] = []
+        self._taken = np.zeros(
+            (0, 0, 0), np.float32
+        )  # their actions, (E, T, A): the state is asked for at every update
         self.steps = self.updates_done = 0
         self.returns: list[float] = []
 
@@ -114,6 +117,7 @@ class Collection:
 
     def _begin(self, seeds: Sequence[int] | None = None) -> None:
         """Begin an episode in every environment."""
+        self._taken = np.zeros((self.schedule.environments, self.plan.steps, self.plan.actions), np.float32)
         if seeds is None:
             key = self._key(_SEED_OF_EPISODES, self.steps)
             drawn = np.random.Generator(np.random.Philox(key=key)).integers(2**31, size=self.schedule.environments)
@@ -124,6 +128,7 @@ class Collection:
         ]
 
     def _send(self, actions: np.ndarray) -> None:
+        self._taken[:, self._length] = actions
         for episode, action in zip(self._playing, actions, strict=True):
             episode.actions.append(action)
         self.steps += len(actions)
@@ -141,11 +146,11 @@ class Collection:
                 episode.frames[name].append(row)
             episode.factors.append(self._factors(after))
             episode.rewards.append(after.reward)
-        if len(self._playing[0].actions) == self.plan.steps or any(m.terminated or m.truncated for m in moved):
+        if self._length == self.plan.steps or any(m.terminated or m.truncated for m in moved):
             self._end(moved)
 
     def _end(self, moved: Sequence[Moved]) -> None:
-        length, planned = len(self._playing[0].actions), self.plan.steps
+        length, planned = self._length, self.plan.steps
         if any(m.terminated or not m.truncated for m in moved) or length != planned:
             raise UserError(
                 f"an episode ended after {length} actions, all are planned to be cut off after {planned}; choose a "
@@ -165,18 +170,18 @@ class Collection:
 
     def state_dict(self) -> dict[str, Any]:
         """Counts, and seeds and actions of the episodes under way."""
-        actions = np.stack([np.stack(episode.actions) for episode in self._playing]) if self._begun else np.zeros(0)
         return {
             "steps": self.steps,
             "updates": self.updates_done,
             "episodes": self.replay.episodes,
             "seeds": [episode.seed for episode in self._playing],
-            "actions": torch.from_numpy(actions.astype(np.float32)),
+            "actions": torch.from_numpy(self._taken[:, : self._length].copy()),
         }
 
     @property
-    def _begun(self) -> bool:
-        return bool(self._playing) and bool(self._playing[0].actions)
+    def _length(self) -> int:
+        """Actions of the episodes under way."""
+        return len(self._playing[0].actions) if self._playing else 0
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where a state was taken: the replay holds its episodes, those under way are played again."""
@@ -185,7 +190,7 @@ class Collection:
         if state["seeds"]:
             self._begin(state["seeds"])
             done = state["actions"].numpy()
-            self.steps -= done[..., 0].size
+            self.steps -= done.shape[0] * done.shape[1]
             for step in range(done.shape[1]):
                 self._receive()
                 self._send(done[:, step])

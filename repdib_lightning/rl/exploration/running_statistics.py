@@ -37,8 +37,10 @@ class RunningStatistics(nn.Module):
 
     @torch.no_grad()
     def take_in(self, features: Tensor) -> None:
-        """Move the averages towards those of a batch (B, M); the first one sets them."""
+        """Move the averages towards those of a batch (B, M), where these are finite; the first one sets them."""
         variance, mean = torch.var_mean(features.to(self.mean.dtype), dim=0, correction=0)
+        sound = variance.isfinite()
+        variance, mean = torch.where(sound, variance, self.variance), torch.where(sound, mean, self.mean)
         rate = torch.where(self.begun > 0, _RATE, 1.0)
         self.mean.lerp_(mean, rate)
         self.variance.lerp_(variance, rate)
