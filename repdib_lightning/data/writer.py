@@ -56,6 +56,8 @@ class EpisodeWriter:
         overwrite: replace an existing file; with ``resume``, discard an unfinished recording, too.
         resume: keep what an interruption leaves, and go on with it.
         keep: with ``resume``, go on after this many episodes and forget later ones; None keeps all.
+        goes_on: with ``resume``, the command that goes on with an unfinished recording, told where one cannot be
+            written further; None for the command that began it.
 
     Raises:
         UserError: the path exists or is a folder, cannot be written, the disk is full, or what is stated cannot be a
@@ -80,6 +82,7 @@ class EpisodeWriter:
         overwrite: bool = False,
         resume: bool = False,
         keep: int | None = None,
+        goes_on: str | None = None,
     ) -> None:
         assert keep is None or resume
         self.path = Path(path)
@@ -94,6 +97,7 @@ class EpisodeWriter:
         self.observations, self.actions = observations, actions
         self._columns = columns_of(observations, actions, factors, masks, rewards)
         self._resume, self._overwrite, self._recordings = resume, overwrite, recordings
+        self._goes_on = goes_on or ("the same command without --overwrite" if overwrite else "the same command")
         self._row = self._episode = 0
         self._hash = ContentHash()
         self._temporary = self.path.with_name(f".{self.path.name}.tmp-{os.getpid()}")
@@ -160,8 +164,7 @@ class EpisodeWriter:
         return UserError(f"{reason}; {self._kept()}" if kept else reason)
 
     def _kept(self) -> str:
-        command = "the same command without --overwrite" if self._overwrite else "the same command"
-        return f"{self._episode} of {self.episodes} episodes are kept, {command} goes on after them"
+        return f"{self._episode} of {self.episodes} episodes are kept, {self._goes_on} goes on after them"
 
     def add_episode(
         self,

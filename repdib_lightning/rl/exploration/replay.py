@@ -98,6 +98,7 @@ class Replay:
             overwrite=keep is None,
             resume=True,
             keep=keep,
+            goes_on=f"fit --resume {path.parent}",
         )
         self._arrays = self._writer.arrays()
 

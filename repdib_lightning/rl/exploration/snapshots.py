@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import re
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,6 +98,8 @@ def write_snapshot(
     """
     tensors = {name: value.detach().float().cpu().contiguous() for name, value in agent.state_dict().items()}
     parts = copy.deepcopy(encoder).float().eval(), copy.deepcopy(bottleneck).float().eval()
+    for left in folder.parent.glob(f".{folder.name}.*"):  # by a run that was killed here
+        shutil.rmtree(left, ignore_errors=True)
     with whole_folder(folder) as aside:
         save_bundle(aside, *parts, training=training, data=data, overwrite=True)
         (aside / AGENT).write_bytes(as_bytes(tensors, {"agent": json.dumps(dict(facts))}))

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -221,6 +225,18 @@ def test_reading_more_than_is_held_in_memory_still_gives_the_right_rows(tmp_path
         if number == 4:
             made.add(episode(3))
     assert made._arrays._read <= 500
+
+
+def test_a_full_disk_names_the_command_that_goes_on(tmp_path, monkeypatch):
+    made = filled(tmp_path / "replay.h5", 2)
+
+    def pwrite(handle, content, offset):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", pwrite)
+    told = rf"cannot be written \(No space.*2 of 7 episodes are kept, fit --resume {re.escape(str(tmp_path))} goes on"
+    with pytest.raises(UserError, match=told):
+        made.add(episode(2))
 
 
 def test_gather_takes_whole_episodes_or_places(tmp_path, store):

@@ -49,6 +49,16 @@ def write(run, frames, made=None, **facts):
     )
 
 
+def test_what_a_killed_run_left_of_a_snapshot_goes_with_the_next_one_there(tmp_path):
+    beside = snapshot_folder(tmp_path, 40)
+    left, other = beside.with_name(f".{beside.name}.tmp-1"), beside.with_name(".frames-000000080.tmp-1")
+    for folder in (left, other):
+        folder.mkdir(parents=True)
+        (folder / AGENT).write_bytes(b"half")
+    write(tmp_path, 40)
+    assert sorted(path.name for path in beside.parent.iterdir()) == sorted([other.name, beside.name])
+
+
 def test_the_bundle_encodes_as_the_parts_do_at_rest(tmp_path):
     made = parts()
     before = copied(made[0]) | copied(made[1])
