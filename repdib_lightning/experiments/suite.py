@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from repdib_lightning.errors import UserError
-from repdib_lightning.rl import FRESH_OPTIONS
+from repdib_lightning.rl import FRESH_OPTIONS, GIVEN_OPTIONS
 
 FIRST_DEVELOPMENT_SEED = 100
 """Seeds below are for reporting only; what is tuned is tuned on this one and above."""
@@ -56,8 +56,15 @@ class Finetune:
 
     def of_an_encoder(self) -> Finetune:
         """The same where an encoder is given: without the options of a fresh one."""
+        return self._without(FRESH_OPTIONS)
+
+    def from_scratch(self) -> Finetune:
+        """The same where no encoder is given: without the options of one that is."""
+        return self._without(GIVEN_OPTIONS)
+
+    def _without(self, left_out: Sequence[str]) -> Finetune:
         runs = {
-            name: {option: value for option, value in options.items() if option not in FRESH_OPTIONS}
+            name: {option: value for option, value in options.items() if option not in left_out}
             for name, options in self.runs.items()
         }
         return replace(self, runs=runs)

@@ -22,7 +22,7 @@ from repdib_lightning.experiments.suite_grids import (
     read_store,
 )
 from repdib_lightning.experiments.suite_measures import check_measures
-from repdib_lightning.rl import FRESH_OPTIONS
+from repdib_lightning.rl import FRESH_OPTIONS, GIVEN_OPTIONS
 
 
 def find_suite(name: str | Path) -> Path:
@@ -104,7 +104,7 @@ def _grids(file: Path, tree: Mapping[str, Any]) -> tuple[Grid, ...]:
     if not isinstance(grids, dict) or not grids:
         raise UserError(f"{file}: grids must map names to grids, is {grids!r:.60}")
     built = tuple(read_grid(file, name, content, common) for name, content in grids.items())
-    _check_fresh_options(file, [finetune, *(content.get("finetune") or {} for content in grids.values())], built)
+    _check_unused_options(file, [finetune, *(content.get("finetune") or {} for content in grids.values())], built)
     made: dict[Path, Grid] = {}
     for grid in built:
         first = made.setdefault(grid.data, grid)
@@ -116,14 +116,17 @@ def _grids(file: Path, tree: Mapping[str, Any]) -> tuple[Grid, ...]:
     return built
 
 
-def _check_fresh_options(file: Path, given: Sequence[Mapping[str, Any]], grids: Sequence[Grid]) -> None:
-    """Options of a fresh encoder are for settings without pre-training; without any, they would be ignored."""
-    from_scratch = [setting.finetune for grid in grids for setting in grid.settings if not setting.pretrained]
-    used = {option for finetune in from_scratch if finetune for run in finetune.runs.values() for option in run}
-    for content in given:
-        for options in (content.get("with"), *(content.get("runs") or {}).values()):
-            for option in set(options or {}) & set(FRESH_OPTIONS) - used:
-                raise UserError(f"{file}: finetune: '{option}' is of a fresh encoder, and every setting is pre-trained")
+def _check_unused_options(file: Path, given: Sequence[Mapping[str, Any]], grids: Sequence[Grid]) -> None:
+    """Options of a fresh encoder are for settings without pre-training, those of a given one for settings with it."""
+    told = [options or {} for each in given for options in (each.get("with"), *(each.get("runs") or {}).values())]
+    for options, pretrained, said in (
+        (FRESH_OPTIONS, False, "a fresh encoder, and every setting is pre-trained"),
+        (GIVEN_OPTIONS, True, "an encoder that is given, and no setting is pre-trained"),
+    ):
+        made = [setting.finetune for grid in grids for setting in grid.settings if setting.pretrained is pretrained]
+        used = {option for finetune in made if finetune for run in finetune.runs.values() for option in run}
+        for option in sorted({option for each in told for option in each} & set(options) - used):
+            raise UserError(f"{file}: finetune: '{option}' is of {said}")
 
 
 def _show(file: Path, names: tuple[str, ...], grid: Grid) -> tuple[str, ...]:

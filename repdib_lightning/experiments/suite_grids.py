@@ -199,8 +199,9 @@ def _named(file: Path, key: str, content: Mapping[str, Any]) -> list[tuple[str, 
 def _setting(file: Path, key: str, bare: Setting, parts: Sequence[Mapping[str, Any]], own: Common) -> Setting:
     fixed, given = parts
     if not _is_pretrained(file, f"{key}.settings.{bare.name}", given, bare):
-        needs_data = bare.finetune is not None and learns_from_data(bare.finetune.agent)
-        return replace(bare, pretrained=False, data=own.data if needs_data else None)
+        assert bare.finetune is not None
+        data = own.data if learns_from_data(bare.finetune.agent) else None
+        return replace(bare, pretrained=False, data=data, finetune=bare.finetune.from_scratch())
     given = {option: value for option, value in given.items() if option != PRETRAINED}
     configs = [*own.base, *(read_config(file, key, c) for part in (fixed, given) for c in listed(part.get(CONFIG, [])))]
     options = {k: v for part in (fixed, given) for k, v in part.items() if k != CONFIG}

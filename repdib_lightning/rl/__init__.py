@@ -23,3 +23,6 @@ that can be known without a bundle and before anything runs."""
 
 FRESH_OPTIONS = ("features", "channels", "strides", "frame_stack")
 """Options of a fresh encoder, which mean nothing beside one that is given."""
+
+GIVEN_OPTIONS = ("frozen", "bottleneck", "bottleneck_losses")
+"""Options of an encoder that is given, which mean nothing without one."""

@@ -71,6 +71,15 @@ def test_every_run_begins_at_every_snapshot_and_from_scratch_once(tmp_path):
     assert scratch.runs["walk"] == {"frames": 5000, "features": 64, "task": "walker-walk"}
 
 
+def test_an_agent_from_scratch_is_the_same_run_beside_encoders_that_are_trained_along(tmp_path):
+    along = {"with": {**FINETUNE["with"], "frozen": False}, "snapshots": [400]}
+    suite = read_suite(write(tmp_path, {**GRID, "along": {"finetune": along, "settings": SETTINGS}}))
+    none, vq, scratch = suite.grid("along").settings
+    assert none.finetune.runs["walk_400"]["frozen"] is vq.finetune.runs["run_400"]["frozen"] is False
+    assert "frozen" not in scratch.finetune.runs["walk"]
+    assert suite.run_by(scratch).place == "walker/scratch" and suite.run_by(vq).place == "along/vq"
+
+
 def test_a_snapshot_is_of_the_run_and_without_one_the_bundle_is_given(tmp_path):
     grids = {**GRID, "end": {"finetune": {"snapshots": []}, "settings": {"own": {"config": "bottleneck/none"}}}}
     suite = read_suite(write(tmp_path, grids))
@@ -106,6 +115,10 @@ def finetune(**changes):
         (
             {"grids": {"walker": OWN}, **finetune(**{"with": {}})},
             r"'walker/vq' writes no snapshot 200, its data\.snapshots are 100, 800$",
+        ),
+        (
+            {"grids": {"g": {"settings": {"new": {"pretrained": False}}}}, **finetune(**{"with": {"frozen": False}})},
+            r"finetune: 'frozen' is of an encoder that is given, and no setting is pre-trained$",
         ),
         ({"data": {"class_path": "ExplorationDataModule"}}, r"'walker/none' does not say which it writes; add data\."),
         ({"data": {"class_path": "EpisodeDataModule"}}, r"'walker/none' does not explore \(its data are no Exp"),
