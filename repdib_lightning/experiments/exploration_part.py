@@ -43,7 +43,7 @@ def exploration_parts(results: Results, grid: Grid, columns: Mapping[str, Mappin
     if finetune is None:
         return []
     figures: dict[str, bytes] = {}
-    sentences = [_told(finetune), _RANKS]
+    sentences = [_told(finetune), *([_RANKS] if _ranked(finetune) else [])]
     for task, column in itertools.product(finetune.snapshots, results.suite.finetune_curves):
         drawn = snapshot_curves(*_bands(grid, finetune, columns, task, column), task=task, column=column)
         if drawn is not None:
@@ -78,11 +78,17 @@ def snapshot_table(results: Results, grid: Grid, finetune: Finetune) -> Table:
             if scratch:
                 cells = _cells(results, grid, scratch, f"{agent}/{task}/{measure}", 1)
                 rows.append([f"{task}: {label}, from scratch", *cells])
-        rows.append([f"{task}: {_RANK}", *_cells(results, grid, pretrained, f"{agent}/{task}/{MONOTONE}", 2)])
-    if len(finetune.snapshots) > 1:
+        if _ranked(finetune):
+            rows.append([f"{task}: {_RANK}", *_cells(results, grid, pretrained, f"{agent}/{task}/{MONOTONE}", 2)])
+    if _ranked(finetune) and len(finetune.snapshots) > 1:
         rules.append(len(rows))
         rows.append([f"mean of all: {_RANK}", *_cells(results, grid, pretrained, f"{agent}/{ALL}/{MONOTONE}", 2)])
     return Table(["mean [95 % interval]", *(setting.name for setting in grid.settings)], rows, tuple(rules[1:]))
+
+
+def _ranked(finetune: Finetune) -> bool:
+    """Whether there are several snapshots to put in order."""
+    return any(len(runs) > 1 for runs in finetune.snapshots.values())
 
 
 def _cells(results: Results, grid: Grid, settings: Sequence[Setting], measure: str, digits: int) -> list[str]:

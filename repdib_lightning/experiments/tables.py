@@ -136,13 +136,14 @@ def claims_table(found: Sequence[Verdict], suite: Suite) -> Table:
         claim = verdict.claim
         bounds = [f"at most {claim.at_most}"] * (claim.at_most is not None)
         bounds += [f"at least {claim.at_least}"] * (claim.at_least is not None)
-        asked = " and ".join(bounds) + _JUDGED_BY[claim.judge]
+        few = 0 < verdict.seeds < FEWEST_SEEDS
+        asked = " and ".join(bounds) + (", in the mean" if few and claim.judge == "mean" else _JUDGED_BY[claim.judge])
         holds = {True: "holds", False: "FAILS", None: "cannot be told"}[verdict.holds]
         grid = suite.grid(claim.grid)
         other = "" if claim.of == "value" else f" against {claim.than or grid.baseline}"
         where = "" if grid is suite.grids[0] else f" (grid {grid.name})"
-        few = f", {verdict.seeds} seeds" if 0 < verdict.seeds < FEWEST_SEEDS else ""
-        about = f"{claim.of} of {claim.measure}, {claim.setting}{other}{where}{few}"
+        seeds = f", {verdict.seeds} seeds" if few else ""
+        about = f"{claim.of} of {claim.measure}, {claim.setting}{other}{where}{seeds}"
         rows.append([claim.text, about, interval(verdict.estimate), asked, holds])
     return Table(["claim", "measured by", "found", "asked for", ""], rows)
 

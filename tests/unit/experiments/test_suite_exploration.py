@@ -313,6 +313,13 @@ def test_the_table_has_every_snapshot_and_from_scratch_on_a_line_of_its_own(resu
     assert "100, 200 and 400 frames of exploration: walk (frames 5000, task walker-walk); run (" in part.sentences[0]
 
 
+def test_one_snapshot_has_no_rank(made, tmp_path):
+    suite = read_suite(write(tmp_path, finetune={**FINETUNE, "snapshots": [400]}))
+    (part,) = exploration_parts(load_results(suite, suite.seeds, made[1]), suite.grids[0], {})
+    told = " ".join([*part.sentences, *(row[0] for row in part.tables[0].rows)])
+    assert "after 400 frames" in told and "rank" not in told.lower()
+
+
 def test_a_grid_without_snapshots_has_no_such_part(tmp_path):
     suite = read_suite(write(tmp_path, finetune=None, grids={"g": TRAINED}))
     finish(suite, tmp_path / "runs", typical)

@@ -157,6 +157,7 @@ def test_a_second_grids_claims_are_held_against_it(results):
         "value of dqn/Spiral/success, scratch, 2 seeds",
         "difference of dqn/Spiral/success, vq against none (grid noisy), 2 seeds",
     ]
+    assert all(row[3].endswith(", in the mean") for row in table.rows), "two seeds have no interval to judge by"
 
 
 def test_other_data_within_a_store_is_refused_and_in_another_is_not(made):
