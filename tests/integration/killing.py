@@ -31,6 +31,7 @@ class KillAfter(Callback):
 
 
 def _child(folder: str, arguments: list[str], environment: dict[str, str]) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     os.chdir(folder)
     os.environ.update(environment)
     import torch

@@ -191,7 +191,6 @@ def test_a_fine_tuning_with_other_options_is_refused_until_it_is_removed(here, c
         ("goals: none", "goals: '6,2'", "finetune run 'Spiral' of g/none: --env SpiralWorld: goals=6,2: lies outside"),
         ("goals: none", "gols: none", "run 'Spiral' of g/none: --env_options.gols: no option of SpiralWorld, did you"),
         ("steps: 300", "frozen: maybe", "finetune run 'Loop' of g/none: frozen: expected bool, got 'maybe'"),
-        ("steps: 300", "frozen: true", "finetune run 'Loop' of g/scratch: --frozen needs --encoder BUNDLE"),
         (
             "steps: 300",
             "strides: [9, 9, 9]",
