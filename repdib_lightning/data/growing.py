@@ -11,7 +11,10 @@ from repdib_lightning.data.episode_checks import Column
 from repdib_lightning.data.row_file import RowFile
 
 _RESIDENT = 2**28
-"""Bytes that are read before what the system mapped for them is given back; it stays in the page cache."""
+"""Bytes that may be mapped before they are given back; they stay in the page cache."""
+
+_HUGE = 2**21
+"""Bytes that the system may map for a row, however small: a huge page."""
 
 
 class GrowingArrays:
@@ -35,11 +38,17 @@ class GrowingArrays:
 
     def gather(self, key: str, rows: np.ndarray) -> np.ndarray:
         """Copy the given rows of one key, in any order and with repeats: (n,) int64 -> (n, ...)."""
-        found: np.ndarray = np.take(self._arrays[key], rows, axis=0)
-        self._read += found.nbytes
-        if self._read > _RESIDENT:
-            self._read = 0
-            self._whole.madvise(mmap.MADV_DONTNEED)
+        array = self._arrays[key]
+        found = np.empty((len(rows), *array.shape[1:]), array.dtype)
+        mapped = max(_HUGE, array[:1].nbytes)
+        at_once = max(1, _RESIDENT // mapped)
+        for first in range(0, len(rows), at_once):
+            part = rows[first : first + at_once]
+            found[first : first + at_once] = array[part]
+            self._read += min(mapped * len(part), array.nbytes)
+            if self._read > _RESIDENT:
+                self._read = 0
+                self._whole.madvise(mmap.MADV_DONTNEED)
         return found
 
 

@@ -358,6 +358,32 @@ def test_the_suite_of_activities(here, capsys):
     assert "| unseen people: here |" in text and "| recognition/perplexity/fused |" in text
 
 
+def test_the_suite_of_exploration(here, capsys):
+    """The packaged suite with one bottleneck and one snapshot, few actions and one seed."""
+    plan = yaml.safe_load(packaged_suites()["urlb"].read_text())
+    words = [*EXPLORED_AT_ONCE, *QUANTISER_AT_ONCE]
+    small = {key.removeprefix("--"): yaml.safe_load(value) for key, value in zip(words[::2], words[1::2], strict=True)}
+    small |= {"data.image_size": 64, "trainer.log_every_n_steps": 1}
+    few = {"frames": 3000, "seed_frames": 1000, "batch_size": 4, "episodes": 2, "evaluate_every": 1000, "hidden": 8}
+    for each in (plan["finetune"], plan["grids"]["trained_along"]["finetune"]):
+        each["with"] |= few
+        each["snapshots"] = [20000]
+    for grid in plan["grids"].values():
+        grid |= {"baseline": "scratch", "settings": {"repdib": small, "scratch": {"pretrained": False}}}
+    del plan["finetune"]["runs"]["walker_run"]
+    told = [text for text in plan["claims"] if "RepDIB" in text and "none at all on walker-walk" in text]
+    plan["claims"] = {text: plan["claims"][text] for text in told}
+    plan["measures"] = ["explore/coverage", "ddpg/walker_walk/return"]
+    plan |= {"seeds": [0], "data": "data/walker_walk_demo.h5", "collect": None}
+    Path("urlb.yaml").write_text(yaml.safe_dump(plan))
+    for command in suite_commands("urlb"):
+        assert main([*command[:2], "urlb.yaml"]) == 0
+        assert "3 finished of 3" in capsys.readouterr().out or command[1] == "report"
+    written = {path.name for path in Path("results/urlb").iterdir()}
+    figures = {f"{grid}-snapshots-walker_walk-eval-return.png" for grid in plan["grids"]}
+    assert {"report.md", "report.html", "walker-curves.png", "walker-values-walker_walk.png", *figures} <= written
+
+
 @pytest.mark.parametrize("name", packaged_suites())
 def test_every_setting_of_every_suite_is_an_option_of_fit(here, name, capsys):
     alike = {(s.configs, tuple(s.options)): s for s in read_suite(name).settings if s.pretrained}
