@@ -227,6 +227,24 @@ def test_reading_more_than_is_held_in_memory_still_gives_the_right_rows(tmp_path
     assert made._arrays._read <= 500
 
 
+def test_one_gather_gives_back_what_huge_pages_map_for_its_rows(tmp_path, monkeypatch):
+    """A row may have a huge page mapped: what a batch of a big replay touches would be gigabytes."""
+    made = filled(tmp_path / "x.h5", 3)
+    arrays, given_back = made._arrays, []
+
+    class Whole:
+        def madvise(self, advice):
+            given_back.append(advice)
+
+    size = arrays._arrays["observations/pixels"].nbytes
+    monkeypatch.setattr(growing, "_HUGE", size // 10)
+    monkeypatch.setattr(growing, "_RESIDENT", size // 4)
+    monkeypatch.setattr(arrays, "_whole", Whole())
+    rows = np.array([0, 17, 3, 3, 9, 12, 1, 16, 8, 2])
+    np.testing.assert_array_equal(arrays.gather("observations/pixels", rows)[:, 0, 0, 0], rows)
+    assert len(given_back) == 2, "after each four rows, two of which are read at once"
+
+
 def test_a_full_disk_names_the_command_that_goes_on(tmp_path, monkeypatch):
     made = filled(tmp_path / "replay.h5", 2)
 
