@@ -1,4 +1,4 @@
-"""The convolution stack of DrQ-v2, for any picture size, channel count and number of views."""
+"""Stacks of plain convolutions (DrQ-v2's, DQN's), for any picture size, channel count and number of views."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from repdib_lightning.records import DataSpec
 
 
 class ConvolutionalEncoder(Encoder):
-    """3x3 convolutions with ReLU, then ``Linear -> LayerNorm -> Tanh`` to M (Yarats et al. 2021, DrQ-v2; as an
-    encoder of width M with its trunk: Islam et al. 2022, ACRO).
+    """Unpadded convolutions with ReLU, then ``Linear -> LayerNorm -> Tanh`` to M. By default the 3x3 convolutions of
+    DrQ-v2 (Yarats et al. 2021; as an encoder of width M with its trunk: Islam et al. 2022, ACRO).
 
     Each view has a stack of its own; their flattened maps are joined before the linear layer. Frame stacks arrive as
     channels.
@@ -21,12 +21,15 @@ class ConvolutionalEncoder(Encoder):
     Args:
         spec: observations; every size is measured from it.
         features: M.
-        channels: channels of each convolution.
+        channels: channels of each convolution: one number for all, or one for each.
         strides: one convolution for each entry. DrQ-v2: [2, 1, 1, 1]; [2, 2, 1, 1] costs a quarter of it.
+        kernels: side of each convolution's kernel; 3 by default. DQN (Mnih et al. 2015), and the Decision Transformer's
+            encoder of Atari: channels [32, 64, 64], strides [4, 2, 1], kernels [8, 4, 3].
         views: names of the pictures to use; all by default.
 
     Raises:
-        UserError: no picture in the spec, an unknown view, or a picture too small for the strides.
+        UserError: no picture in the spec, an unknown view, lists of different lengths, or a picture too small for the
+            convolutions.
     """
 
     def __init__(
@@ -34,21 +37,27 @@ class ConvolutionalEncoder(Encoder):
         spec: DataSpec,
         *,
         features: int = 256,
-        channels: int = 32,
+        channels: int | list[int] = 32,
         strides: list[int] | None = None,
         views: list[str] | None = None,
+        kernels: list[int] | None = None,
     ) -> None:
         views = image_views(spec, views, "ConvolutionalEncoder")
         super().__init__(seen_only(spec, views), features)
         self.views = views
         strides = [2, 1, 1, 1] if strides is None else strides
-        if channels < 1 or not strides or min(strides) < 1:
-            raise UserError(f"ConvolutionalEncoder: channels ({channels}) and strides ({strides}) must be at least 1")
+        kernels = [3] * len(strides) if kernels is None else kernels
+        widths = [channels] * len(strides) if isinstance(channels, int) else channels
+        if not len(widths) == len(kernels) == len(strides) or min([*widths, *kernels, *strides], default=0) < 1:
+            raise UserError(
+                f"ConvolutionalEncoder: channels ({channels}), strides ({strides}) and kernels ({kernels}) must be at "
+                "least 1, and lists equally long"
+            )
         self.stacks = nn.ModuleDict()
         width = 0
         for view in self.views:
             shape = spec.observations[view].shape
-            stack = convolution_stack(shape[0], channels, strides)
+            stack = convolution_stack(shape[0], widths, strides, kernels)
             self.stacks[view] = stack
             width += flat_width(stack, view, shape)
         self.trunk = nn.Sequential(nn.Linear(width, features), nn.LayerNorm(features), nn.Tanh())
@@ -60,12 +69,12 @@ class ConvolutionalEncoder(Encoder):
         return self.trunk(torch.cat(maps, dim=1))
 
 
-def convolution_stack(in_channels: int, channels: int, strides: list[int]) -> nn.Sequential:
-    """One unpadded 3x3 convolution with ReLU for each stride."""
+def convolution_stack(in_channels: int, channels: list[int], strides: list[int], kernels: list[int]) -> nn.Sequential:
+    """An unpadded convolution with ReLU for each entry of the lists."""
     layers: list[nn.Module] = []
-    for stride in strides:
-        layers += [nn.Conv2d(in_channels, channels, 3, stride), nn.ReLU()]
-        in_channels = channels
+    for width, stride, kernel in zip(channels, strides, kernels, strict=True):
+        layers += [nn.Conv2d(in_channels, width, kernel, stride), nn.ReLU()]
+        in_channels = width
     return nn.Sequential(*layers)
 
 
@@ -79,10 +88,12 @@ def flat_width(stack: nn.Sequential, view: str, shape: tuple[int, ...]) -> int:
     channels = shape[0]
     for layer in stack:
         if isinstance(layer, nn.Conv2d):
-            stride, channels = layer.stride[0], layer.out_channels
-            height, width = (height - 3) // stride + 1, (width - 3) // stride + 1
+            stride, kernel, channels = layer.stride[0], layer.kernel_size[0], layer.out_channels
+            height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
         if height < 1 or width < 1:
-            raise UserError(f"ConvolutionalEncoder: '{view}' of {shape[1]}x{shape[2]} pixels is too small for strides")
+            raise UserError(
+                f"ConvolutionalEncoder: '{view}' of {shape[1]}x{shape[2]} pixels is too small for its convolutions"
+            )
     return channels * height * width
 
 

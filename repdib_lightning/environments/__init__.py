@@ -8,6 +8,8 @@ from repdib_lightning.environments.urlb_tasks import URLB_TASKS, gymnasium_name
 
 COLLECTORS = {
     "activities": "repdib_lightning.environments.collect_activities:collect_activities",
+    "atari": "repdib_lightning.environments.collect_atari:collect_atari",
+    "atari_policy": "repdib_lightning.environments.train_atari_policy:train_atari_policy",
     "control": "repdib_lightning.environments.collect_control:collect_control",
     "emoji_styles": "repdib_lightning.environments.collect_emoji_styles:collect_emoji_styles",
     "maze": "repdib_lightning.environments.collect_maze:collect_maze",
@@ -34,6 +36,7 @@ GYMNASIUM_IDS = {
         f"repdib/{gymnasium_name(task)}-v0": "repdib_lightning.environments.control_env:ControlEnv"
         for task in URLB_TASKS
     },
+    "repdib/Atari-v0": "repdib_lightning.environments.atari_env:AtariEnv",
     "repdib/Control-v0": "repdib_lightning.environments.control_env:ControlEnv",
     "repdib/RobotArm-v0": "repdib_lightning.environments.robot_arm_env:RobotArmEnv",
 }

@@ -6,6 +6,7 @@ AGENTS = {
     "bc": "repdib_lightning.rl.finetune_offline:finetune_bc",
     "ddpg": "repdib_lightning.rl.finetune_online:finetune_ddpg",
     "dqn": "repdib_lightning.rl.finetune_dqn:finetune_dqn",
+    "dt": "repdib_lightning.rl.finetune_dt:finetune_dt",
     "sac": "repdib_lightning.rl.finetune_online:finetune_sac",
     "td3bc": "repdib_lightning.rl.finetune_offline:finetune_td3bc",
 }
@@ -15,6 +16,7 @@ CHECKS = {
     "bc": "repdib_lightning.rl.finetune_offline:check_bc",
     "ddpg": "repdib_lightning.rl.finetune_online:check_ddpg",
     "dqn": "repdib_lightning.rl.finetune_dqn:check_dqn",
+    "dt": "repdib_lightning.rl.finetune_dt:check_dt",
     "sac": "repdib_lightning.rl.finetune_online:check_sac",
     "td3bc": "repdib_lightning.rl.finetune_offline:check_td3bc",
 }

@@ -13,14 +13,28 @@ from repdib_lightning.errors import UserError
 from repdib_lightning.rl.environment import open_environment
 from repdib_lightning.rl.offline_options import NO_ENVIRONMENT
 
-CONTROL = "repdib/Control-v0"
-_SHORT = "Control"
+CONTROL, ATARI = "repdib/Control-v0", "repdib/Atari-v0"
+_SHORT = {"Control": CONTROL, "Atari": ATARI}
 _VD4RL = "dm_control/"
 
-_FIXED = ("task", "action_repeat", "image_size", "distractor_seed")
+_FIXED = {
+    CONTROL: ("task", "action_repeat", "image_size", "distractor_seed"),
+    ATARI: ("game", "frame_skip", "image_size", "side_width", "distractor_seed"),
+}
 """Of a recording; evaluated otherwise, its return would be that of another problem, or amid clips that were seen."""
 
 _TAKEN = ("task", "action_repeat", "image_size", "quality", "distractors", "place", "source")
+_TAKEN_OF_ATARI = (
+    "game",
+    "image_size",
+    "frame_skip",
+    "sticky",
+    "noop_max",
+    "max_frames",
+    "side",
+    "side_width",
+    "side_source",
+)
 
 
 def evaluated_environment(
@@ -39,16 +53,16 @@ def evaluated_environment(
         if options:
             raise UserError("--env_options mean nothing with --env none; leave one of them out")
         return None
-    recorded = recorded_options(store)
-    if env and (env not in (CONTROL, _SHORT) or recorded is None):
-        held_out = {"evaluation": True} if env in (CONTROL, _SHORT) else {}
+    recorded_in, recorded = recorded_environment(store)
+    if env and (_SHORT.get(env, env) != recorded_in or recorded is None):
+        held_out = {"evaluation": True} if _SHORT.get(env, env) in _FIXED else {}
         return env, {**held_out, **options}
     if recorded is None:
         raise UserError(
             f"{store.path}: does not tell in which environment it was recorded; name one with --env, or train without "
             "evaluation with --env none"
         )
-    for name in _FIXED:
+    for name in _FIXED[recorded_in]:
         if name in options and name in recorded and _spelled(options[name]) != _spelled(recorded[name]):
             raise UserError(
                 f"--env_options.{name} {options[name]}: {store.path} was recorded with {recorded[name]}; leave it out, "
@@ -57,12 +71,23 @@ def evaluated_environment(
     chosen = {"evaluation": True, **recorded, **options}
     if chosen.get("distractors") == "none":  # what was recorded of them means nothing then
         chosen = {name: value for name, value in chosen.items() if name in options or name not in ("place", "source")}
-    return CONTROL, chosen
+    return recorded_in, chosen
 
 
 def _spelled(option: Any) -> Any:
-    """``walker_walk`` and ``walker-walk`` are the same task."""
-    return option.replace("_", "-") if isinstance(option, str) else option
+    """``walker_walk`` and ``walker-walk`` are the same task; ``MsPacman`` and ``ms_pacman`` the same game."""
+    return option.lower().replace("_", "").replace("-", "") if isinstance(option, str) else option
+
+
+def recorded_environment(store: EpisodeStore) -> tuple[str, dict[str, Any] | None]:
+    """Where a store was recorded, and the options there; an empty name and None where it does not tell."""
+    if str(store.attributes.get("environment", "")) == "atari" and "configuration" in store.attributes:
+        configuration = json.loads(store.attributes["configuration"])
+        found = {name: configuration[name] for name in _TAKEN_OF_ATARI if name in configuration}
+        drawn = {"distractor_seed": configuration["seed"]} if "seed" in configuration else {}
+        return ATARI, {**found, **drawn}
+    recorded = recorded_options(store)
+    return ("" if recorded is None else CONTROL), recorded
 
 
 def recorded_options(store: EpisodeStore) -> dict[str, Any] | None:
@@ -91,4 +116,20 @@ def open_all(name: str, options: Mapping[str, Any], count: int, actions: int) ->
     if not isinstance(space, gymnasium.spaces.Box) or space.shape != (actions,):
         opened[0].close()
         raise UserError(f"--env {name}: its actions are {space}, those of the data are continuous, {actions} wide")
+    return opened + [open_environment(name, options) for _ in range(count - 1)]
+
+
+def open_discrete(name: str, options: Mapping[str, Any], count: int, actions: int) -> list[gymnasium.Env[Any, Any]]:
+    """Open copies of an environment with discrete actions.
+
+    Raises:
+        UserError: no such environment, bad options, or another number of actions than the data's.
+    """
+    opened = [open_environment(name, options)]
+    space = opened[0].action_space
+    if not isinstance(space, gymnasium.spaces.Discrete) or space.n != actions:
+        opened[0].close()
+        discrete = isinstance(space, gymnasium.spaces.Discrete)
+        there = f"has {space.n} actions" if discrete else f"has no discrete actions but {space}"  # type: ignore[attr-defined]
+        raise UserError(f"--env {name}: {there}, the data have {actions} discrete ones")
     return opened + [open_environment(name, options) for _ in range(count - 1)]

@@ -12,5 +12,6 @@ IMPORTERS: dict[str, str] = {
     "pacs": "repdib_lightning.data.importers.pacs:import_pacs",
     "mmact": "repdib_lightning.data.importers.mmact:import_mmact",
     "smartwatch": "repdib_lightning.data.importers.smartwatch:import_smartwatch",
+    "dqn_replay": "repdib_lightning.data.importers.dqn_replay:import_dqn_replay",
     "store": "repdib_lightning.data.importers.repack:import_store",
 }

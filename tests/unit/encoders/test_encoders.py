@@ -71,6 +71,28 @@ def test_the_paper_width_at_84_pixels():
     assert encoder.trunk[0].in_features == 39_200
 
 
+def test_the_convolutions_of_dqn_have_its_sizes():
+    """Mnih et al. 2015: 84 px become 20, 9 and 7, so that 64 * 7 * 7 = 3136 numbers reach the linear layer."""
+    spec = DataSpec({"frame": ArraySpec((4, 84, 84))}, frame_stack=4)
+    encoder = ConvolutionalEncoder(spec, features=128, channels=[32, 64, 64], strides=[4, 2, 1], kernels=[8, 4, 3])
+    shapes, seen = [], torch.zeros(1, 4, 84, 84)
+    for layer in encoder.stacks["frame"]:
+        seen = layer(seen)
+        shapes.append(tuple(seen.shape[1:]))
+    assert shapes[::2] == [(32, 20, 20), (64, 9, 9), (64, 7, 7)] and encoder.trunk[0].in_features == 3136
+    rebuilt = ConvolutionalEncoder(spec, **encoder.arguments)
+    rebuilt.load_state_dict(encoder.state_dict())
+    assert torch.equal(rebuilt(pictures(spec)), encoder(pictures(spec)))
+
+
+@pytest.mark.parametrize(
+    "sizes", [{"channels": [8, 8]}, {"kernels": [3]}, {"kernels": [3, 3, 3, 0]}, {"channels": 0}, {"strides": []}]
+)
+def test_sizes_of_convolutions_that_do_not_fit_together_are_named(sizes):
+    with pytest.raises(UserError, match=r"channels .* strides .* and kernels .* equally long"):
+        ConvolutionalEncoder(SPECS["one view"], **sizes)
+
+
 def test_a_picture_too_small_for_the_strides():
     with pytest.raises(UserError, match="'eye' of 12x12 pixels is too small"):
         ConvolutionalEncoder(DataSpec({"eye": ArraySpec((3, 12, 12))}), strides=[2, 2, 2])
