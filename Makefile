@@ -54,7 +54,7 @@ control: install
 	$(RUN) suite run control
 	$(RUN) suite report control
 
-# The paper's reward-free exploration on the walker, three seeds: about 3.5 hours on 2 cores; goes on where it stopped.
+# The paper's reward-free exploration on the walker, three seeds: about 3.7 hours on 2 cores; goes on where it stopped.
 urlb: install
 	$(RUN) suite run urlb
 	$(RUN) suite report urlb

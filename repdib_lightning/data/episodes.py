@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -191,6 +192,12 @@ class EpisodeStore:
             else:
                 self._maps[name] = np.memmap(self.path, dtype=dtype, mode="r", offset=offset, shape=shape)
         return self._maps[name]
+
+    def let_go(self) -> None:
+        """Give back the memory that mapped rows take in this process; they are read again where they are asked for."""
+        for array in self._maps.values():
+            if isinstance(array, np.memmap):
+                array._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
 
     def _dtype_in_memory(self, name: str, stored: np.dtype[Any]) -> np.dtype[Any]:
         if name == "actions":

@@ -30,7 +30,7 @@ class GrowingArrays:
     def __init__(self, file: RowFile, columns: Mapping[str, Column]) -> None:
         self._whole, places = file.mapped(list(columns))
         self._arrays = {key: self._array(columns[key], *places[key], file.rows) for key in columns}
-        self._read = 0
+        self._mapped_bytes = 0
 
     def _array(self, column: Column, offset: int, width: int, rows: int) -> np.ndarray:
         flat = np.frombuffer(self._whole, np.dtype(column.stored_dtype), rows * width // _size(column), offset)
@@ -45,9 +45,9 @@ class GrowingArrays:
         for first in range(0, len(rows), at_once):
             part = rows[first : first + at_once]
             found[first : first + at_once] = array[part]
-            self._read += min(mapped * len(part), array.nbytes)
-            if self._read > _RESIDENT:
-                self._read = 0
+            self._mapped_bytes += min(mapped * len(part), array.nbytes)
+            if self._mapped_bytes > _RESIDENT:
+                self._mapped_bytes = 0
                 self._whole.madvise(mmap.MADV_DONTNEED)
         return found
 

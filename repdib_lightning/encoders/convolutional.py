@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from repdib_lightning.encoders.base import Encoder
+from repdib_lightning.encoders.mean_picture import MeanPicture
 from repdib_lightning.encoders.views import centred, image_views, seen_only
 from repdib_lightning.errors import UserError
 from repdib_lightning.records import DataSpec
@@ -26,6 +27,7 @@ class ConvolutionalEncoder(Encoder):
         kernels: side of each convolution's kernel; 3 by default. DQN (Mnih et al. 2015), and the Decision Transformer's
             encoder of Atari: channels [32, 64, 64], strides [4, 2, 1], kernels [8, 4, 3].
         views: names of the pictures to use; all by default.
+        subtract_mean: subtract the mean picture of the training data (:class:`MeanPicture`), in place of one half.
 
     Raises:
         UserError: no picture in the spec, an unknown view, lists of different lengths, or a picture too small for the
@@ -41,6 +43,7 @@ class ConvolutionalEncoder(Encoder):
         strides: list[int] | None = None,
         views: list[str] | None = None,
         kernels: list[int] | None = None,
+        subtract_mean: bool = False,
     ) -> None:
         views = image_views(spec, views, "ConvolutionalEncoder")
         super().__init__(seen_only(spec, views), features)
@@ -53,10 +56,13 @@ class ConvolutionalEncoder(Encoder):
                 f"ConvolutionalEncoder: channels ({channels}), strides ({strides}) and kernels ({kernels}) must be at "
                 "least 1, and lists equally long"
             )
+        self.means = nn.ModuleDict()
         self.stacks = nn.ModuleDict()
         width = 0
         for view in self.views:
             shape = spec.observations[view].shape
+            if subtract_mean:
+                self.means[view] = MeanPicture(shape)
             stack = convolution_stack(shape[0], widths, strides, kernels)
             self.stacks[view] = stack
             width += flat_width(stack, view, shape)
@@ -65,8 +71,12 @@ class ConvolutionalEncoder(Encoder):
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
         """Encode name -> (N, S * C, H, W) uint8 into (N, M) in (-1, 1)."""
-        maps = [self.stacks[view](centred(observations[view])).flatten(1) for view in self.views]
+        maps = [self.stacks[view](self._centred(view, observations[view])).flatten(1) for view in self.views]
         return self.trunk(torch.cat(maps, dim=1))
+
+    def _centred(self, view: str, pictures: Tensor) -> Tensor:
+        found: Tensor = self.means[view](pictures) if view in self.means else centred(pictures)
+        return found
 
 
 def convolution_stack(in_channels: int, channels: list[int], strides: list[int], kernels: list[int]) -> nn.Sequential:

@@ -82,4 +82,5 @@ def encode_store(
             latents, codes = encode_rows(encoder, store, rows, device=encoder.device, progress=False)
             seen = {LATENT: latents} if codes is None else {LATENT: latents, CODES: codes.astype(np.float32)}
             writer.add_episode(observations=seen, **kept_of_episode(store, episode))
+            store.let_go()  # else the process would hold all that was read of the data
     return Path(output)

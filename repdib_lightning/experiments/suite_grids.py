@@ -35,7 +35,7 @@ from repdib_lightning.rl import AGENTS
 PRETRAINED = "pretrained"
 """Key of a setting: false for one without pre-training."""
 
-SET_FOR_FINETUNE = ("seed", "encoder", "run", "overwrite", "data", SNAPSHOT)
+SET_FOR_FINETUNE = ("seed", "encoder", "run", "overwrite", "resume", "data", SNAPSHOT)
 """Options of ``finetune`` that follow from the point, or from the suite's list of snapshots."""
 
 PLACES = ("task", "env")

@@ -10,6 +10,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from repdib_lightning.bottlenecks import RepDIB, VectorQuantiser
 from repdib_lightning.encoders import MultimodalEncoder
+from repdib_lightning.encoders.mean_picture import MeanPicture
 from repdib_lightning.encoders.present_rows import pass_present
 from repdib_lightning.encoders.running_standardisation import RunningStandardisation
 
@@ -117,11 +118,23 @@ def standardise(rank):
     return {"seen": seen, "state": module.state_dict()}
 
 
+def centre(rank):
+    """Pictures of two batches, as :func:`standardise` has rows."""
+    module, seen = MeanPicture((1, 2, 2)), []
+    for seed in range(2):
+        pictures = torch.randint(0, 256, (9, 1, 2, 2), generator=torch.Generator().manual_seed(seed)).byte()
+        seen.append(module(pictures if rank is None else pictures.tensor_split([2])[rank]))
+    return {"seen": seen, "state": module.state_dict()}
+
+
 def one_of_two(rank, folder):
     torch.set_num_threads(1)
     distributed.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=2)
     saved = {name: quantise(rank, name) for name in SHARES}
-    torch.save({**saved, **train_distributed(rank), "standardised": standardise(rank)}, f"{folder}/{rank}.pt")
+    torch.save(
+        {**saved, **train_distributed(rank), "standardised": standardise(rank), "centred": centre(rank)},
+        f"{folder}/{rank}.pt",
+    )
     distributed.destroy_process_group()
 
 
@@ -148,8 +161,9 @@ def test_two_processes_train_on_what_one_would(both, name):
         assert torch.equal(shares[0]["state"][key], shares[1]["state"][key])
 
 
-def test_two_processes_standardise_as_one_would(both):
-    alone, shares = standardise(None), [result["standardised"] for result in both]
+@pytest.mark.parametrize(("name", "run"), [("standardised", standardise), ("centred", centre)])
+def test_two_processes_standardise_as_one_would(both, name, run):
+    alone, shares = run(None), [result[name] for result in both]
     for batch, expected in enumerate(alone["seen"]):
         torch.testing.assert_close(torch.cat([share["seen"][batch] for share in shares]), expected)
     for key, value in alone["state"].items():

@@ -224,7 +224,7 @@ def test_reading_more_than_is_held_in_memory_still_gives_the_right_rows(tmp_path
             np.testing.assert_array_equal(batch.observations["pixels"][place], slow(store, row, 3, 0.99, 2)[0])
         if number == 4:
             made.add(episode(3))
-    assert made._arrays._read <= 500
+    assert made._arrays._mapped_bytes <= 500
 
 
 def test_one_gather_gives_back_what_huge_pages_map_for_its_rows(tmp_path, monkeypatch):
