@@ -41,6 +41,9 @@ class RepresentationModule(pl.LightningModule):
         shift: random shift of the pictures while training, in pixels (DrQ-v2: 4 at 84 px), the same for all frames of a
             video; 0 turns it off.
         scheduler_interval: when the scheduler advances, after every ``step`` or every ``epoch``.
+        encode_once: encode a frame that a batch has several times, such as a future that was drawn twice, once; its
+            copies then share one draw of a bottleneck's noise, and a codebook counts it once. Faster where many futures
+            are drawn of a short horizon. It needs ``shift`` 0, which would make the copies differ.
 
     Attributes:
         target: the slowly following copy of encoder and bottleneck, where the objective has a ``target_rate``.
@@ -63,6 +66,7 @@ class RepresentationModule(pl.LightningModule):
         warmup: dict[str, int] | None = None,
         shift: int = 4,
         scheduler_interval: Literal["step", "epoch"] = "step",
+        encode_once: bool = False,
     ) -> None:
         super().__init__()
         self.build_encoder, self.build_bottleneck, self.build_objective = encoder, bottleneck, objective
@@ -72,12 +76,17 @@ class RepresentationModule(pl.LightningModule):
         self.warmup = warmup or {}
         self.shift = shift
         self.scheduler_interval = scheduler_interval
+        self.encode_once = encode_once
         self.target = None
         self.tables: dict[str, Tensor] = {}
         self._held_out = SampleMeans()
         self._held_out_metrics: dict[str, MetricCollection] = {}
         if shift < 0:
             raise UserError(f"model.shift must not be negative, is {shift}")
+        if shift and encode_once:
+            raise UserError(
+                f"model.encode_once: the copies of a frame differ by model.shift, which is {shift}; set it to 0"
+            )
 
     def configure_model(self) -> None:
         """Build encoder, bottleneck and objective from the data module's spec (once)."""
@@ -221,9 +230,12 @@ class RepresentationModule(pl.LightningModule):
         def encode(observations: dict[str, Tensor]) -> Tensor:
             assert not bottlenecks, "an objective encodes all its frames in one pass"
             flat, lead = self._frames(observations)
-            output = self(flat)
-            bottlenecks.append(output)
-            return output.latent.unflatten(0, lead)
+            if not self.encode_once or lead != batch.offsets.shape:
+                bottlenecks.append(self(flat))
+                return bottlenecks[0].latent.unflatten(0, lead)
+            first, place = distinct_frames(batch)
+            bottlenecks.append(self({name: frames[first] for name, frames in flat.items()}))
+            return bottlenecks[0].latent[place].unflatten(0, lead)
 
         targets = () if self.target is None else (self._encode_by_target,)
         objective: ObjectiveOutput = self.objective(batch, encode, *targets)
@@ -281,3 +293,11 @@ def named_values(stage: str, loss: Tensor, output: ObjectiveOutput, terms: dict[
     values |= {f"{stage}/raw/{name}": value.detach() for name, value in output.losses.items()}
     values |= {f"{stage}/weighted/{name}": value.detach() for name, value in terms.items()}
     return values | {f"{stage}/{name}": value for name, value in output.metrics.items()}
+
+
+def distinct_frames(batch: Batch) -> tuple[Tensor, Tensor]:
+    """Where each distinct frame of a batch is met (n,), and which of them each of its B * F frames is (B * F,)."""
+    rows = (batch.rows[:, None] + batch.offsets).flatten()
+    found, place = rows.unique(return_inverse=True)
+    places = torch.arange(len(rows), device=rows.device)
+    return places.new_zeros(len(found)).scatter_reduce_(0, place, places, "amin", include_self=False), place

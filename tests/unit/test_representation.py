@@ -14,7 +14,7 @@ from repdib_lightning.data.datamodule import EpisodeDataModule
 from repdib_lightning.encoders import ConvolutionalEncoder
 from repdib_lightning.errors import UserError
 from repdib_lightning.objectives import InverseDynamics, Prototypes
-from repdib_lightning.representation import RepresentationModule
+from repdib_lightning.representation import RepresentationModule, distinct_frames
 
 
 @pytest.fixture
@@ -299,3 +299,34 @@ def test_a_target_stays_precise_in_half_precision(data):
     moved = model.target.encoder.trunk[0].weight - before
     wanted = 0.001 * (model.encoder.trunk[0].weight.float() - before)
     torch.testing.assert_close(moved, wanted, rtol=1e-2, atol=1e-7)
+
+
+def test_a_frame_of_several_samples_is_encoded_once(store_file):
+    data = EpisodeDataModule(str(store_file), batch_size=12, horizon=2, futures=6)
+    data.setup()
+    batch = next(iter(data.train_dataloader()))
+    rows = (batch.rows[:, None] + batch.offsets).flatten()
+    passes, results = {}, {}
+    for once in (False, True):
+        model = module(data.spec, lambda width: Identity(width), shift=0, encode_once=once)
+        passes[once] = []
+        model.encoder.register_forward_hook(lambda *hooked, seen=passes[once]: seen.append(len(hooked[2])))
+        loss = model._evaluate(batch).losses["inverse"]
+        loss.backward()
+        results[once] = loss, torch.cat([p.grad.flatten() for p in model.parameters()])
+    assert passes == {False: [len(rows)], True: [len(set(rows.tolist()))]} and passes[True] < passes[False]
+    torch.testing.assert_close(results[True][0], results[False][0])
+    torch.testing.assert_close(results[True][1], results[False][1], rtol=1e-4, atol=1e-6)
+
+
+def test_distinct_frames_are_where_they_are_first_met(data):
+    batch = next(iter(data.train_dataloader()))
+    rows = (batch.rows[:, None] + batch.offsets).flatten()
+    first, place = distinct_frames(batch)
+    assert torch.equal(rows[first][place], rows)
+    assert first.tolist() == sorted((rows.tolist().index(row) for row in set(rows.tolist())), key=lambda i: rows[i])
+
+
+def test_copies_that_a_shift_makes_differ_are_not_one_frame(data):
+    with pytest.raises(UserError, match=r"encode_once.*model\.shift, which is 4; set it to 0"):
+        module(data.spec, encode_once=True)
