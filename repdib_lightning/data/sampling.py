@@ -50,6 +50,8 @@ class FutureSampling:
         seed: of the stream.
         next_frame: a sample has F = 2 + n frames, of which the second is t + 1, whatever K. The order and the n futures
             drawn are those without it.
+        consecutive: T, how many anchors that follow each other are drawn together; the order is drawn of these runs,
+            whose beginnings differ between epochs. 1 draws each anchor by itself.
 
     Raises:
         UserError: an episode is not longer than the horizon, or the split is empty.
@@ -64,6 +66,7 @@ class FutureSampling:
         futures: int,
         seed: int,
         next_frame: bool = False,
+        consecutive: int = 1,
     ) -> None:
         if horizon < 1 or futures < 0:
             raise UserError(f"horizon ({horizon}) must be at least 1, futures ({futures}) not negative")
@@ -76,6 +79,9 @@ class FutureSampling:
             raise UserError(_too_short(store, episodes, int(short[0]), ahead, next_frame=next_frame))
         spans = [np.arange(store.starts[e], store.starts[e] + store.lengths[e] - ahead) for e in episodes]
         self.anchors = np.concatenate(spans)
+        self.consecutive = consecutive
+        self._places = np.concatenate([np.arange(len(span)) for span in spans])  # of each anchor in its episode
+        self._episodes = np.repeat(np.arange(len(spans)), [len(span) for span in spans])
         self.horizon, self.futures, self.seed, self.next_frame = horizon, futures, seed, next_frame
         self._epoch = -1
 
@@ -107,9 +113,21 @@ class FutureSampling:
     def _prepare(self, epoch: int) -> None:
         if epoch != self._epoch:
             generator = np.random.Generator(np.random.Philox(key=np.array([self.seed, epoch], np.uint64)))
-            self._order = generator.permutation(self.anchors)
+            alone = self.consecutive == 1
+            self._order = generator.permutation(self.anchors) if alone else self._in_runs(generator)
             self._offsets = generator.integers(1, self.horizon + 1, (len(self), self.futures))
             self._epoch = epoch
+
+    def _in_runs(self, generator: np.random.Generator) -> np.ndarray:
+        """All anchors, runs of T of an episode at once; the first and the last of an episode may be shorter."""
+        phases = generator.integers(self.consecutive, size=int(self._episodes[-1]) + 1)
+        runs = (self._places + phases[self._episodes]) // self.consecutive
+        begins = np.flatnonzero(np.diff(runs, prepend=-1) | np.diff(self._episodes, prepend=-1))
+        lengths = np.diff(begins, append=len(self.anchors))
+        order = generator.permutation(len(begins))
+        ends = np.cumsum(lengths[order])
+        within = np.arange(len(self.anchors)) - np.repeat(ends - lengths[order], lengths[order])
+        return self.anchors[np.repeat(begins[order], lengths[order]) + within]
 
 
 def _empty_split(store: EpisodeStore, split: Split) -> str:

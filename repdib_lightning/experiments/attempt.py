@@ -119,7 +119,7 @@ class Attempt:
         asked = self.point.suite.probe_of(self.point.setting)
         chosen = [word for key, value in asked.items() for word in (f"--{key}", str(value))]
         kept = ["--output", f"{run}/{PROBE_FILE}", "--samples", f"{run}/{SAMPLES_FILE}"]
-        return [run, str(self.point.setting.data), *kept, *chosen]
+        return [run, str(self.point.setting.probed_on), *kept, *chosen]
 
     def _finetune_options(self, name: str) -> list[str]:
         given = self.point.encoder_of(name)

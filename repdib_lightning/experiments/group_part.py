@@ -30,12 +30,12 @@ def group_parts(results: Results) -> list[Part]:
 
 def _drawings(results: Results, grid: Grid, setting: Setting) -> dict[str, bytes]:
     point = next((p for seed in results.seeds if (p := results.point(setting, seed))), None)
-    if point is None or not setting.pretrained or setting.data is None:
+    if point is None or not setting.pretrained or setting.probed_on is None:
         return {}
     own = results.suite.probe_of(setting).get("groups")
     drawn = open_redrawing(
         point.folder / "bundle",
-        setting.data,
+        setting.probed_on,
         groups=None if own is None else int(own),
         count=PICTURES,
         split="evaluation",

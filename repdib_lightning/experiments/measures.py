@@ -30,7 +30,7 @@ class Facts:
         configuration: config.yaml as a tree, and under ``finetune`` what each fine-tuning used.
         versions, data: of environment.json; without pre-training the versions of the first fine-tuning, and no data. Of
             an exploration the data are its replay.
-        probed: the store that an exploration was probed on, by file and fingerprint; empty for other runs.
+        probed: the store that it was probed on, by file and fingerprint, where that is not its data; else empty.
         factors: name -> ``state`` or ``noise``.
         metrics: name -> number; see :func:`collect_measures`.
     """
@@ -89,7 +89,8 @@ def _pretrained(run: Path, probe: Path) -> Facts:
         metrics = {**_trained(run), **_probed(report)}
         explored = explores(configuration)
         data = _replay(run, environment["data"]) if explored else environment["data"]
-        probed = {"file": report["data"], "fingerprint": report["fingerprint"]} if explored else {}
+        read = {"file": report["data"], "fingerprint": report["fingerprint"]}
+        probed = read if explored or read["fingerprint"] != data["fingerprint"] else {}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
         raise UserError(f"{run}: not a finished and probed run ({type(error).__name__}: {error})") from error
     return Facts(configuration, environment["versions"], data, factors, metrics, probed)

@@ -50,10 +50,13 @@ def facts_of(results: Results) -> list[str]:
 
 def _stores(results: Results) -> str:
     """What the encoders were trained on; nothing where there are none."""
-    given = [record.data for record in results.records.values() if record.data and not record.probed]
-    probed = [record.probed for record in results.records.values() if record.probed]
+    pairs = [(point.setting, results.records[key]) for key, point in results.points.items()]
+    given = [record.data for setting, record in pairs if record.data and not setting.explores]
+    probed = [record.probed for setting, record in pairs if record.probed and not setting.explores]
+    explored = [record.probed for setting, record in pairs if setting.explores]
     told = f", on {_listed(given)}" if given else ""
-    return told + f", each exploration on a replay of its own and probed on {_listed(probed)}" if probed else told
+    told += f", probed on {_listed(probed)}" if probed else ""
+    return told + f", each exploration on a replay of its own and probed on {_listed(explored)}" if explored else told
 
 
 def _listed(stores: Sequence[Mapping[str, str]]) -> str:

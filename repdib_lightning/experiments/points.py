@@ -40,7 +40,7 @@ class Record:
         finished: whether every phase is done; only then are the following filled in.
         configuration: everything that the run used. versions: of the packages.
         data: file and fingerprint of what it was trained on; of an exploration its own replay.
-        probed: the same of the store that an exploration was probed on; empty for other points.
+        probed: the same of the store that it was probed on, where that is another one; else empty.
         threads: that each process had.
         factors: name -> ``state`` or ``noise``.
         metrics: measure -> number (see :mod:`repdib_lightning.experiments.measures`).

@@ -30,11 +30,11 @@ def recognition_parts(results: Results) -> list[Part]:
 
 def _drawings(results: Results, grid: Grid, setting: Setting) -> dict[str, bytes]:
     point = next((p for seed in results.seeds if (p := results.point(setting, seed))), None)
-    if point is None or not setting.pretrained or setting.data is None:
+    if point is None or not setting.pretrained or setting.probed_on is None:
         return {}
     drawn, _ = recognition_figures(
         point.folder / "bundle",
-        setting.data,
+        setting.probed_on,
         f"{setting.place}, seed {point.seed}",
         clips=CLIPS,
         split="evaluation",

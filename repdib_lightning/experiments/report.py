@@ -14,6 +14,7 @@ from repdib_lightning.evaluation import figures as probe_figures
 from repdib_lightning.evaluation.report import Section, write_report
 from repdib_lightning.evaluation.samples import ProbeSamples, read_samples
 from repdib_lightning.experiments import figures, tables
+from repdib_lightning.experiments.against import against_parts
 from repdib_lightning.experiments.comparison import Difference, Summary, differences, summaries
 from repdib_lightning.experiments.curve_names import check_curves
 from repdib_lightning.experiments.curves import Band, bands, finetune_bands, write_bands
@@ -64,7 +65,8 @@ def report_suite(
     all_maps = {grid.name: mean_maps(results, grid) for grid in plan.grids}
     found = {grid.name: (summaries(results, grid), differences(results, grid)) for grid in plan.grids}
     parts = [*_headline_part(results), *_grid_parts(results, found, all_bands, all_maps), *_latent_parts(results)]
-    parts = [*overview_parts(results), *parts, *group_parts(results), *recognition_parts(results), *film_parts(results)]
+    parts = [*overview_parts(results), *parts, *against_parts(results)]
+    parts += [*group_parts(results), *recognition_parts(results), *film_parts(results)]
     _write(folder, results, parts, all_bands)
     if any(all_maps.values()):
         write_maps(folder / "maps.json", all_maps)

@@ -87,21 +87,22 @@ def load_results(suite: Suite, seeds: Iterable[int], runs: Path) -> Results:
 
 
 def _check_same_data(points: dict[tuple[str, int], Point], records: dict[tuple[str, int], Record]) -> None:
-    """A store is the same for all that were trained, or after exploring probed, on it; from scratch there is none."""
-    firsts: dict[Path, tuple[str, int]] = {}
+    """A store is the same for all that were trained or probed on it."""
+    firsts: dict[Path, tuple[Point, str | None]] = {}
     for other, record in records.items():
-        store = points[other].setting.data
-        if store is None:
-            continue
-        key = firsts.setdefault(store, other)
-        if _data_of(record).get("fingerprint") != _data_of(records[key]).get("fingerprint"):
-            done = "probed" if record.probed else "trained"
-            raise UserError(
-                f"{points[other].folder}: was {done} on other data than {points[key].folder} (fingerprints differ); "
-                "remove one of them and run the suite again"
-            )
+        for store, done, used in _stores_of(points[other], record):
+            first, expected = firsts.setdefault(store, (points[other], used.get("fingerprint")))
+            if used.get("fingerprint") != expected:
+                raise UserError(
+                    f"{points[other].folder}: was {done} on other data than {first.folder} (fingerprints differ); "
+                    "remove one of them and run the suite again"
+                )
 
 
-def _data_of(record: Record) -> dict[str, str]:
-    """The store that the suite names."""
-    return record.probed or record.data
+def _stores_of(point: Point, record: Record) -> list[tuple[Path, str, dict[str, str]]]:
+    """The stores that the suite names, what was done on each, and what it was then; from scratch there may be none."""
+    setting = point.setting
+    found = [(setting.data, "trained", record.data), (setting.probe_data, "probed", record.probed)]
+    if setting.explores:  # on a replay of its own
+        found = [(setting.probed_on, "probed", record.probed)]
+    return [(store, done, used) for store, done, used in found if store is not None]

@@ -169,8 +169,9 @@ def prepare_data(plan: Suite, points: Sequence[Point]) -> None:
     Raises:
         UserError: one of them cannot be read.
     """
-    commands = {grid.data: grid.collect for grid in plan.grids}
-    for store in dict.fromkeys(point.setting.data for point in points):
+    commands = {store: words for grid in plan.grids for store, words in grid.stores.items()}
+    needed = ((point.setting.data, point.setting.probe_data) for point in points)
+    for store in dict.fromkeys(itertools.chain.from_iterable(needed)):
         if store is None:
             continue
         if not store.exists() and commands[store]:

@@ -90,6 +90,7 @@ class Setting:
         options: dotted key -> value, over all of them.
         merged: what these files and options say together.
         data: the store that it is trained and probed on, or only probed on if it explores; None without pre-training.
+        probe_data: the store that it is probed on in place of ``data``; None for that one.
         pretrained: whether there is an encoder to train, export and probe; else fine-tuning begins from scratch.
         finetune: what follows; None for nothing.
     """
@@ -100,8 +101,14 @@ class Setting:
     options: Mapping[str, Any]
     merged: Mapping[str, Any]
     data: Path | None = None
+    probe_data: Path | None = None
     pretrained: bool = True
     finetune: Finetune | None = None
+
+    @property
+    def probed_on(self) -> Path | None:
+        """The store that it is probed on; None without pre-training."""
+        return self.probe_data or self.data
 
     @property
     def place(self) -> str:
@@ -139,6 +146,7 @@ class Grid:
         collect: words of a ``collect`` command that makes the store where it is absent; empty for none.
         seeds: of the suite's reported seeds, those that its settings are run with; empty for all.
         probe: options of ``probe`` in place of the suite's; None for those.
+        probe_data, probe_collect: the store that its settings are probed on in place of ``data``, and what makes it.
     """
 
     name: str
@@ -149,6 +157,19 @@ class Grid:
     collect: tuple[str, ...]
     seeds: tuple[int, ...] = ()
     probe: Mapping[str, Any] | None = None
+    probe_data: Path | None = None
+    probe_collect: tuple[str, ...] = ()
+
+    @property
+    def stores(self) -> dict[Path, tuple[str, ...]]:
+        """Store -> words of the command that makes it."""
+        own = {self.data: self.collect}
+        return own if self.probe_data is None else {**own, self.probe_data: self.probe_collect}
+
+    def numbers(self, option: str) -> dict[str, float]:
+        """Name of a setting -> value of a dotted option of ``fit``, of those whose value is a number."""
+        found = {setting.name: _at(setting.merged, option) for setting in self.settings}
+        return {name: float(v) for name, v in found.items() if isinstance(v, int | float) and not isinstance(v, bool)}
 
     def has_seed(self, seed: int, reported: Sequence[int]) -> bool:
         """Whether its settings are run with a seed: one of its own, or one that the suite does not report."""
@@ -198,6 +219,21 @@ class Claim:
 
 
 @dataclass(frozen=True)
+class Against:
+    """A figure of measures against a number that a grid's settings vary.
+
+    Attributes:
+        name: of the figure. grid: whose settings. option: dotted, as ``fit`` takes it; a setting where it is no number
+            is drawn as a horizontal line. measures: a panel each.
+    """
+
+    name: str
+    grid: str
+    option: str
+    measures: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Suite:
     """Everything that a suite's file says.
 
@@ -216,6 +252,7 @@ class Suite:
         show: settings of the first grid whose latents and drawn pictures are shown. colours: factors that colour them.
         maps: settings whose maps of mazes are shown; empty for all.
         overview: measures that the report draws over all grids, first of all.
+        against: figures of measures against a number that a grid's settings vary.
         films: places (``grid/setting``) of the settings whose policies are shown in films.
         drawn_groups: places of the settings of which the report shows what each group draws.
         recognised: places of the settings of which the report shows what is recognised, and by which modality.
@@ -242,6 +279,7 @@ class Suite:
     maps: tuple[str, ...] = ()
     films: tuple[str, ...] = ()
     overview: tuple[str, ...] = ()
+    against: tuple[Against, ...] = ()
     drawn_groups: tuple[str, ...] = ()
     recognised: tuple[str, ...] = ()
 
@@ -287,7 +325,7 @@ def explores(merged: Mapping[str, Any]) -> bool:
 def identity(setting: Setting) -> str:
     """A text that is equal for two settings that are the same run."""
     finetune = None if setting.finetune is None else asdict(setting.finetune)
-    parts = [setting.merged, setting.data, setting.pretrained, finetune]
+    parts = [setting.merged, setting.data, setting.probe_data, setting.pretrained, finetune]
     return json.dumps(parts, sort_keys=True, default=str)
 
 
@@ -304,6 +342,13 @@ def check_seeds(seeds: Sequence[int], *, tune: bool, where: str) -> None:
                 f"{where}: seed {seed} is for development, what it shows is not reported; add --tune, or take seeds "
                 f"below {FIRST_DEVELOPMENT_SEED}"
             )
+
+
+def _at(tree: Mapping[str, Any], option: str) -> Any:
+    value: Any = tree
+    for word in option.split("."):
+        value = value.get(word) if isinstance(value, Mapping) else None
+    return value
 
 
 def _as_word(value: Any) -> str:

@@ -10,8 +10,16 @@ import yaml
 
 from repdib_lightning import configurations
 from repdib_lightning.errors import UserError, nearest
-from repdib_lightning.experiments.suite import PROBE_OPTIONS, Claim, Grid, HeadlineRow, Suite
-from repdib_lightning.experiments.suite_checks import check_choice, check_keys, check_number, listed, mapping, words
+from repdib_lightning.experiments.suite import PROBE_OPTIONS, Against, Claim, Grid, HeadlineRow, Suite
+from repdib_lightning.experiments.suite_checks import (
+    check_choice,
+    check_keys,
+    check_name,
+    check_number,
+    listed,
+    mapping,
+    words,
+)
 from repdib_lightning.experiments.suite_grids import (
     Common,
     read_collect,
@@ -20,6 +28,7 @@ from repdib_lightning.experiments.suite_grids import (
     read_grid,
     read_seeds,
     read_store,
+    with_probe_data,
 )
 from repdib_lightning.experiments.suite_measures import check_measures
 from repdib_lightning.rl import FRESH_OPTIONS, GIVEN_OPTIONS
@@ -51,7 +60,12 @@ def read_suite(name: str | Path) -> Suite:
         tree = yaml.safe_load(file.read_text())
     except (yaml.YAMLError, ValueError, OSError) as error:
         raise UserError(f"{file}: not valid YAML ({str(error).splitlines()[-1].strip()})") from error
-    check_keys(file, "", tree, {"base", "finetune", *Suite.__dataclass_fields__} - {"name", "file"})
+    check_keys(
+        file,
+        "",
+        tree,
+        {"base", "finetune", "probe_data", "probe_collect", *Suite.__dataclass_fields__} - {"name", "file"},
+    )
     for key in ("base", "data", "grids"):
         if key not in tree:
             raise UserError(f"{file}: '{key}' is missing (needed: base, data, grids)")
@@ -83,6 +97,7 @@ def read_suite(name: str | Path) -> Suite:
         colours=words(file, "colours", tree.get("colours", [])),
         finetune_curves=words(file, "finetune_curves", tree.get("finetune_curves", ["eval/success"])),
         films=words(file, "films", tree.get("films", []), places),
+        against=tuple(_against(file, *item, built) for item in mapping(file, "against", tree.get("against")).items()),
         drawn_groups=words(file, "drawn_groups", tree.get("drawn_groups", []), places),
         recognised=words(file, "recognised", tree.get("recognised", []), places),
         maps=words(file, "maps", tree.get("maps", []), [s.name for grid in built for s in grid.settings]),
@@ -100,6 +115,7 @@ def _grids(file: Path, tree: Mapping[str, Any]) -> tuple[Grid, ...]:
         collect=read_collect(file, "collect", tree.get("collect")),
         finetune=finetune,
     )
+    common = with_probe_data(file, "", tree, common)
     grids = tree["grids"]
     if not isinstance(grids, dict) or not grids:
         raise UserError(f"{file}: grids must map names to grids, is {grids!r:.60}")
@@ -107,12 +123,14 @@ def _grids(file: Path, tree: Mapping[str, Any]) -> tuple[Grid, ...]:
     _check_unused_options(file, [finetune, *(content.get("finetune") or {} for content in grids.values())], built)
     made: dict[Path, Grid] = {}
     for grid in built:
-        first = made.setdefault(grid.data, grid)
-        if grid.collect != first.collect:
-            raise UserError(
-                f"{file}: grids.{grid.name}.collect: {grid.data} is made by '{' '.join(first.collect)}' for grid "
-                f"'{first.name}'; give the stores different names"
-            )
+        for store, command in grid.stores.items():
+            first = made.setdefault(store, grid)
+            if command != first.stores[store]:
+                key = "collect" if store == grid.data else "probe_collect"
+                raise UserError(
+                    f"{file}: grids.{grid.name}.{key}: {store} is made by '{' '.join(first.stores[store])}' for grid "
+                    f"'{first.name}'; give the stores different names"
+                )
     return built
 
 
@@ -145,6 +163,23 @@ def _headline_row(file: Path, label: str, content: Any, grids: Sequence[Grid]) -
         check_choice(file, f"{key}.paper", setting, settings)
         check_number(file, f"{key}.paper.{setting}", value)
     return HeadlineRow(label, str(content.get("measure", "")), paper, content.get("grid", ""))
+
+
+def _against(file: Path, name: str, content: Any, grids: Sequence[Grid]) -> Against:
+    key = f"against.{name}"
+    check_name(file, key, name)
+    check_keys(file, key, content, {"grid", "option", "measures"})
+    for needed in ("grid", "option", "measures"):
+        if needed not in content:
+            raise UserError(f"{file}: {key}.{needed} is missing")
+    check_choice(file, f"{key}.grid", content["grid"], [grid.name for grid in grids])
+    made = Against(name, content["grid"], str(content["option"]), words(file, f"{key}.measures", content["measures"]))
+    grid = next(grid for grid in grids if grid.name == made.grid)
+    if len(set(grid.numbers(made.option).values())) < 2:
+        raise UserError(
+            f"{file}: {key}.option: no two settings of '{grid.name}' have different numbers as {made.option}"
+        )
+    return made
 
 
 def _claim(file: Path, text: str, content: Any, grids: Sequence[Grid]) -> Claim:

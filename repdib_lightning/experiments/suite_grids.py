@@ -48,19 +48,23 @@ class Common:
 
     Attributes:
         base: configurations. data: the store. collect: words of the command that makes it. finetune: as in the file.
+        probe_data, probe_collect: the store for probing alone, where there is one, and what makes it.
     """
 
     base: tuple[str, ...]
     data: Path
     collect: tuple[str, ...]
     finetune: Mapping[str, Any]
+    probe_data: Path | None = None
+    probe_collect: tuple[str, ...] = ()
 
 
 def read_grid(file: Path, name: str, content: Any, common: Common) -> Grid:
     """One grid. Raises UserError naming the file and the key."""
     key = f"grids.{name}"
     check_name(file, key, name)
-    known = {"about", "baseline", "with", "vary", "settings", "data", "collect", "finetune", "seeds", "probe"}
+    known = {"about", "baseline", "with", "vary", "settings", "finetune", "seeds", "probe"}
+    known |= {"data", "collect", "probe_data", "probe_collect"}
     check_keys(file, key, content, known)
     own = _own(file, key, content, common)
     named = f"{key}.finetune" if content.get("finetune") else "finetune"
@@ -89,7 +93,8 @@ def read_grid(file: Path, name: str, content: Any, common: Common) -> Grid:
     seeds = read_seeds(file, f"{key}.seeds", content["seeds"]) if "seeds" in content else ()
     about = str(content.get("about", ""))
     probe = check_keys(file, f"{key}.probe", content["probe"], set(PROBE_OPTIONS)) if "probe" in content else None
-    return Grid(name, about, baseline, tuple(settings), own.data, own.collect, seeds, probe)
+    stores = {field: getattr(own, field) for field in ("data", "collect", "probe_data", "probe_collect")}
+    return Grid(name, about, baseline, tuple(settings), seeds=seeds, probe=probe, **stores)
 
 
 def read_store(file: Path, key: str, given: Any) -> Path:
@@ -169,8 +174,23 @@ def _own(file: Path, key: str, content: Mapping[str, Any], common: Common) -> Co
         common = replace(common, data=data, collect=common.collect if data == common.data else ())
     if content.get("collect") is not None:
         common = replace(common, collect=read_collect(file, f"{key}.collect", content["collect"]))
+    common = with_probe_data(file, f"{key}.", content, common)
     finetune = mapping(file, f"{key}.finetune", content.get("finetune"))
     return replace(common, finetune={**common.finetune, **finetune})
+
+
+def with_probe_data(file: Path, where: str, content: Mapping[str, Any], common: Common) -> Common:
+    """With what a file, or a grid of it, says of a store for probing."""
+    if content.get("probe_data") is not None:
+        data = read_store(file, f"{where}probe_data", content["probe_data"])
+        kept = common.probe_collect if data == common.probe_data else ()
+        common = replace(common, probe_data=data, probe_collect=kept)
+    if content.get("probe_collect") is not None:
+        if common.probe_data is None:
+            raise UserError(f"{file}: {where}probe_collect makes a store that is not named; add probe_data")
+        words = read_collect(file, f"{where}probe_collect", content["probe_collect"])
+        common = replace(common, probe_collect=words)
+    return common
 
 
 def _varied(file: Path, key: str, content: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
@@ -209,7 +229,8 @@ def _setting(file: Path, key: str, bare: Setting, parts: Sequence[Mapping[str, A
         options = {"data.path": str(own.data), **options}
     together = _together(configs, options)
     finetune = None if bare.finetune is None else bare.finetune.of_an_encoder()
-    return replace(bare, configs=tuple(configs), options=options, merged=together, data=own.data, finetune=finetune)
+    on_data = replace(bare, data=own.data, probe_data=own.probe_data)
+    return replace(on_data, configs=tuple(configs), options=options, merged=together, finetune=finetune)
 
 
 def _from_snapshots(file: Path, content: Mapping[str, Any], setting: Setting, own: Common) -> Setting:

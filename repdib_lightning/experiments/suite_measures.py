@@ -48,6 +48,9 @@ def check_measures(suite: Suite) -> None:
         _check(suite, "measures", measure, suite.grids)
     for measure in suite.overview:
         _check(suite, "overview", measure, suite.grids)
+    for entry in suite.against:
+        for measure in entry.measures:
+            _check(suite, f"against.{entry.name}.measures", measure, [suite.grid(entry.grid)])
     for claim in suite.claims:
         _check(suite, f"claims.{claim.text}.measure", claim.measure, [suite.grid(claim.grid)])
     for row in suite.headline:

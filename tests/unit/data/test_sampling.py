@@ -52,6 +52,26 @@ def test_every_epoch_visits_every_anchor_once_in_another_order(store):
     assert len(sampling.anchors) == (13 - 4) + (9 - 4)
 
 
+@pytest.mark.parametrize("consecutive", [2, 3, 100])
+def test_runs_of_anchors_cut_each_episode_evenly_and_visit_every_anchor_once(store, consecutive):
+    alone = FutureSampling(store, "train", horizon=2, futures=1, seed=3)
+    runs = FutureSampling(store, "train", horizon=2, futures=1, seed=3, consecutive=consecutive)
+    phases = set()
+    for epoch in range(6):
+        order, _ = runs.draw(np.arange(epoch * len(runs), (epoch + 1) * len(runs)))
+        assert sorted(order) == sorted(alone.anchors)
+        episodes = store.row_episodes[order]
+        broken = np.flatnonzero((np.diff(order) != 1) | (np.diff(episodes) != 0)) + 1
+        begins = np.concatenate([[0], broken])
+        places = order[begins] - store.starts[episodes[begins]]
+        for episode in np.unique(episodes):
+            inside = places[(episodes[begins] == episode) & (places > 0)]
+            assert len({int(place) % consecutive for place in inside}) <= 1
+            phases |= {int(place) % consecutive for place in inside}
+        assert max(np.diff(begins, append=len(order))) >= min(consecutive, 4), "and keep together what follows"
+    assert consecutive == 100 or len(phases) == consecutive, "runs begin elsewhere in other epochs"
+
+
 def test_a_sample_is_a_function_of_seed_and_number(store):
     numbers = np.array([41, 3, 17, 90])
     one, other = (FutureSampling(store, "train", horizon=4, futures=2, seed=3) for _ in range(2))

@@ -92,9 +92,10 @@ def test_the_record_of_the_probe_becomes_measures_by_name(tmp_path):
         perplexity={"cam1": 12.0, "fused": 30.0},
     )
     record = {"factors": {}, "summary": {}, "codebook": None, "recognition": report.to_dict()}
+    record |= {"data": "a.h5", "fingerprint": "f"}
     (tmp_path / "probe.json").write_text(json.dumps(record))
     (tmp_path / "config.yaml").write_text("{}")
-    (tmp_path / "environment.json").write_text('{"versions": {}, "data": {}}')
+    (tmp_path / "environment.json").write_text('{"versions": {}, "data": {"fingerprint": "f"}}')
     (tmp_path / "metrics.csv").write_text("epoch,step,val/loss\n0,9,1.0\n")
     found = collect_measures(tmp_path, tmp_path / "probe.json").metrics
     assert found == {

@@ -96,6 +96,25 @@ def test_a_grid_lays_its_own_fine_tunings_data_and_collect_over_the_suites(tmp_p
     assert place(suite, "only/own").phases == ("fit", "export", "probe")
 
 
+def test_a_grid_may_be_probed_on_a_store_of_its_own(tmp_path):
+    grids = {
+        "g": GRID,
+        "h": {**GRID, "data": "data/b.h5", "probe_data": "data/q.h5", "probe_collect": "maze --samples 9"},
+        "i": {**GRID, "probe_data": "data/r.h5"},
+    }
+    suite = read(tmp_path, grids, collect="maze", probe_data="data/p.h5", probe_collect="maze --samples 5")
+    assert [grid.stores for grid in suite.grids] == [
+        {Path("data/a.h5"): ("maze",), Path("data/p.h5"): ("maze", "--samples", "5")},
+        {Path("data/b.h5"): (), Path("data/q.h5"): ("maze", "--samples", "9")},
+        {Path("data/a.h5"): ("maze",), Path("data/r.h5"): ()},
+    ]
+    places = [place(suite, f"{name}/none") for name in "ghi"]
+    assert [str(setting.probed_on) for setting in places] == ["data/p.h5", "data/q.h5", "data/r.h5"]
+    assert [setting.merged["data"]["init_args"]["path"] for setting in places] == [f"data/{n}.h5" for n in "aba"]
+    assert place(suite, "g/scratch").probed_on is None
+    assert place(read(tmp_path), "g/none").probed_on == Path("data/a.h5")
+
+
 # which are the same run
 
 
@@ -106,6 +125,7 @@ def test_a_grid_lays_its_own_fine_tunings_data_and_collect_over_the_suites(tmp_p
         ({"about": "other words"}, True),
         ({"data": "data/a.h5"}, True),
         ({"data": "data/b.h5"}, False),
+        ({"probe_data": "data/b.h5"}, False),
         ({"finetune": {"with": {"steps": 9}}}, False),
         ({"finetune": {"runs": {}}}, False),
     ],
@@ -245,6 +265,13 @@ def finetune(**keys):
             text({"g": GRID, "h": {**LATER, "data": "data/a.h5", "collect": "other"}}, collect="maze"),
             r"grids\.h\.collect: data/a\.h5 is made by 'maze' for grid 'g'",
         ),
+        (
+            text({"g": GRID, "h": {**LATER, "probe_collect": "other"}}, probe_data="data/q.h5", probe_collect="maze"),
+            r"grids\.h\.probe_collect: data/q\.h5 is made by 'maze' for grid 'g'",
+        ),
+        (text(probe_collect="maze"), r"yaml: probe_collect makes a store that is not named; add probe_data"),
+        (grid(probe_collect="maze"), r"grids\.g\.probe_collect makes a store that is not named; add probe_data"),
+        (grid(probe_data=3), r"grids\.g\.probe_data must name a store"),
         (finetune(agents="dqn"), r"unknown key 'finetune\.agents', did you mean 'agent'"),
         (finetune(agent="dqm"), r"finetune\.agent: 'dqm' is not known, did you mean 'dqn'"),
         (finetune(agent="REMOVED"), r"finetune\.agent must name an agent, such as dqn, is None"),
