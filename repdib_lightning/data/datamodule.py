@@ -47,6 +47,8 @@ class EpisodeDataModule(pl.LightningDataModule):
         consecutive: anchors that follow each other in an episode and are drawn together for training. With
             ``model.encode_once`` they share most of their frames: with futures up to 8 steps on, runs of 8 anchors cost
             2 encoded frames an anchor instead of 6, for samples that are less different.
+        leave_out_short: leave out episodes that are not longer than the horizon, and say how many, where they would
+            otherwise be refused.
     """
 
     def __init__(
@@ -65,13 +67,15 @@ class EpisodeDataModule(pl.LightningDataModule):
         target: str = "",
         held_out: dict[str, list[str | int]] | None = None,
         consecutive: int = 1,
+        leave_out_short: bool = False,
     ) -> None:
         super().__init__()
         self.path = Path(path)
         self.batch_size, self.horizon, self.futures = batch_size, horizon, futures
         self.frame_stack, self.views, self.workers, self.seed = frame_stack, views, workers, seed
         self.resident, self.next_frame, self.collect = resident, next_frame, collect
-        self.target, self.held_out, self.consecutive = target, as_names(held_out), consecutive
+        self.target, self.held_out = target, as_names(held_out)
+        self.consecutive, self.leave_out_short = consecutive, leave_out_short
         bounds = (("batch_size", 1), ("horizon", 1), ("futures", 0), ("frame_stack", 1), ("consecutive", 1))
         for name, least in bounds:
             if getattr(self, name) < least:
@@ -111,6 +115,10 @@ class EpisodeDataModule(pl.LightningDataModule):
         self._measured = training_statistics(store, self._used_views())
         self._training = self._sampling("train")
         self._evaluation = self._sampling("evaluation")
+        left_out = self._training.left_out + self._evaluation.left_out
+        if left_out:
+            told = f"{left_out} of {len(store.starts)} episodes are no longer than the horizon {self.horizon}"
+            print(f"{self.path}: {told}: left out", file=sys.stderr, flush=True)
 
     def _sampling(self, split: Split) -> FutureSampling:
         assert self.store is not None
@@ -122,6 +130,7 @@ class EpisodeDataModule(pl.LightningDataModule):
             seed=self.seed,
             next_frame=self.next_frame,
             consecutive=self.consecutive if split == "train" else 1,
+            leave_out_short=self.leave_out_short,
         )
 
     @property

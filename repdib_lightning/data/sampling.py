@@ -52,9 +52,14 @@ class FutureSampling:
             drawn are those without it.
         consecutive: T, how many anchors that follow each other are drawn together; the order is drawn of these runs,
             whose beginnings differ between epochs. 1 draws each anchor by itself.
+        leave_out_short: leave out episodes that are not longer than the horizon.
+
+    Attributes:
+        anchors: (A,) int64, their rows. left_out: episodes that were too short.
 
     Raises:
-        UserError: an episode is not longer than the horizon, or the split is empty.
+        UserError: an episode is not longer than the horizon, or, where these are left out, none is; or the split is
+            empty.
     """
 
     def __init__(
@@ -67,6 +72,7 @@ class FutureSampling:
         seed: int,
         next_frame: bool = False,
         consecutive: int = 1,
+        leave_out_short: bool = False,
     ) -> None:
         if horizon < 1 or futures < 0:
             raise UserError(f"horizon ({horizon}) must be at least 1, futures ({futures}) not negative")
@@ -75,8 +81,10 @@ class FutureSampling:
         if not len(episodes):
             raise UserError(_empty_split(store, split))
         short = episodes[store.lengths[episodes] <= ahead]
-        if len(short):
+        if len(short) and not (leave_out_short and len(short) < len(episodes)):
             raise UserError(_too_short(store, episodes, int(short[0]), ahead, next_frame=next_frame))
+        self.left_out = len(short)
+        episodes = np.setdiff1d(episodes, short, assume_unique=True)
         spans = [np.arange(store.starts[e], store.starts[e] + store.lengths[e] - ahead) for e in episodes]
         self.anchors = np.concatenate(spans)
         self.consecutive = consecutive

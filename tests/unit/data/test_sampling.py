@@ -96,6 +96,22 @@ def rows_of(batches):
     return [batch.rows.tolist() for batch in batches]
 
 
+def test_short_episodes_are_left_out_where_that_is_asked_for(tmp_path, make_store, capsys):
+    path = make_store(tmp_path / "a.h5", lengths=[9, 3, 8, 4, 9])
+    store = EpisodeStore(path)
+    with pytest.raises(UserError, match="fewer than the horizon 5"):
+        FutureSampling(store, "train", horizon=5, futures=1, seed=0)
+    left = FutureSampling(store, "train", horizon=5, futures=1, seed=0, leave_out_short=True)
+    kept = [episode for episode in store.episodes("train") if store.lengths[episode] > 5]
+    episodes = store.row_episodes[left.anchors]
+    assert sorted(set(episodes)) == kept and left.left_out == len(store.episodes("train")) - len(kept)
+    assert (left.anchors + 5 < (store.starts + store.lengths)[episodes]).all()
+    with pytest.raises(UserError, match="fewer than the horizon 20"):
+        FutureSampling(store, "train", horizon=20, futures=1, seed=0, leave_out_short=True)
+    EpisodeDataModule(str(path), batch_size=2, horizon=5, leave_out_short=True).setup()
+    assert "2 of 5 episodes are no longer than the horizon 5: left out" in capsys.readouterr().err
+
+
 def test_batches_hold_the_frames_of_their_rows(store):
     batch = next(iter(loader(store)))
     pixels = batch.observations["front"][:, :, 0, 0, 0]

@@ -93,7 +93,5 @@ def test_points_of_one_probe_store_must_have_been_probed_on_the_same_data(tmp_pa
     facts = " ".join(facts_of(load_results(suite, suite.seeds, tmp_path / "runs")))
     assert "on x.h5 (fingerprint abc), probed on q.h5 (fingerprint q1)," in facts
     probed(points[3], "q2")
-    with pytest.raises(
-        UserError, match=rf"{Path(points[3].folder).name}: was probed on other data"
-    ):
+    with pytest.raises(UserError, match=rf"{Path(points[3].folder).name}: was probed on other data"):
         load_results(suite, suite.seeds, tmp_path / "runs")
