@@ -5,7 +5,7 @@ BIN := .venv/bin
 RUN := $(BIN)/python -m repdib_lightning
 DEMO := runs/demo
 
-.PHONY: install demo demo-control robot-arm mazes control urlb bench bench-gpu test lint clean
+.PHONY: install demo demo-control demo-atari robot-arm mazes control urlb atari bench bench-gpu test lint clean
 
 install: .venv/installed
 
@@ -39,6 +39,15 @@ demo-control: install
 			--run runs/demo_control/$$kind/td3bc --hidden 256 --steps 3000 --evaluate_every 1500 || exit 1; \
 	done
 
+# A game's cartridge to a policy, amid a picture on the side: data, an encoder, probes, a Decision Transformer, a film.
+demo-atari: install
+	rm -rf runs/demo_atari
+	$(RUN) fit --config atari --config demo_atari --run runs/demo_atari/repdib
+	$(RUN) export runs/demo_atari/repdib
+	$(RUN) probe runs/demo_atari/repdib/bundle data/breakout_demo.h5 --probes linear
+	$(RUN) finetune dt --data data/breakout_demo.h5 --encoder runs/demo_atari/repdib --run runs/demo_atari/repdib/dt \
+		--layers 3 --heads 4 --width 64 --stride 10 --batch_size 64 --epochs 8 --evaluate_every 4
+
 # The paper's robot-arm table, five seeds, full size: 35 runs, about 100 minutes on 2 cores; goes on where it stopped.
 robot-arm: install
 	$(RUN) suite run robot_arm
@@ -58,6 +67,11 @@ control: install
 urlb: install
 	$(RUN) suite run urlb
 	$(RUN) suite report urlb
+
+# The paper's offline Atari, three to five seeds: 47 runs; goes on where it stopped.
+atari: install
+	$(RUN) suite run atari
+	$(RUN) suite report atari
 
 # Speed against peers and limits, about 20 minutes; writes results/benchmarks.md. Close other programs first.
 bench bench-gpu: install

@@ -20,6 +20,7 @@ from killing import command_in_processes
 from repdib_lightning.__main__ import VERBS, main
 from repdib_lightning.configurations import packaged, packaged_suites
 from repdib_lightning.data.frame_features import store_features
+from repdib_lightning.environments.collect_atari import collect_atari
 from repdib_lightning.environments.collect_control import collect_control
 from repdib_lightning.environments.collect_emoji_styles import collect_emoji_styles
 from repdib_lightning.environments.collect_maze import collect_maze
@@ -56,6 +57,13 @@ def control_recording(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def atari_recording(tmp_path_factory):
+    """Twenty short games of Breakout at the real size."""
+    path = tmp_path_factory.mktemp("atari") / "breakout.h5"
+    return collect_atari(path, samples=800, max_frames=160, mixture={"random": 1.0}, workers=1, progress=False)
+
+
+@pytest.fixture(scope="session")
 def drawings(tmp_path_factory):
     """Drawings at the real size, some of the styles and species."""
     folder = tmp_path_factory.mktemp("drawings")
@@ -83,7 +91,7 @@ def clips(tmp_path_factory):
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch, recording, maze_recording, control_recording, drawings, clips):
+def here(tmp_path, monkeypatch, recording, maze_recording, control_recording, atari_recording, drawings, clips):
     monkeypatch.chdir(tmp_path)
     Path("data").mkdir()
     for name in ("walker_walk_video", "walker_walk_demo", "vd4rl_walker_walk_video"):
@@ -93,6 +101,9 @@ def here(tmp_path, monkeypatch, recording, maze_recording, control_recording, dr
         shutil.copy(drawings / f"{name}.h5", "data")
     for name in ("activities", "mmact", "smartwatch"):
         Path(f"data/{name}.h5").hardlink_to(clips / f"{name}.h5")
+    for name in ("breakout", "pong", "qbert", "seaquest"):
+        for stem in (name, f"{name}_probe", f"{name}_demo", f"dqn_{name}"):
+            Path(f"data/{stem}.h5").hardlink_to(atari_recording)
     shutil.copy(recording, "data/robot_arm.h5")
     shutil.copy(recording, "data/robot_arm_demo.h5")
     return tmp_path
@@ -101,9 +112,11 @@ def here(tmp_path, monkeypatch, recording, maze_recording, control_recording, dr
 PAPER = "paper/vd4rl/multi_step_inverse"
 HAMLET, MMACT = "activities/hamlet", "paper/mmact/hamlet"
 EXPLORATION, PAPER_EXPLORATION = "urlb/walker_repdib", "paper/urlb/walker"
+ATARI, PAPER_ATARI = "atari", "paper/atari/breakout"
+GAMES = ("pong", "qbert", "seaquest")
 BASES = (
     *("robot_arm", "mazes", "control", "factors", HAMLET, f"{HAMLET}_repdib", PAPER, MMACT),
-    *(EXPLORATION, PAPER_EXPLORATION),
+    *(EXPLORATION, PAPER_EXPLORATION, ATARI, PAPER_ATARI),
 )
 """Configurations of a whole run; the others are laid over one of them."""
 
@@ -128,6 +141,9 @@ LAYERS = [
     *([EXPLORATION, f"bottleneck/{name}"] for name in ("none", "vq")),
     *([EXPLORATION, f"urlb/{domain}"] for domain in ("quadruped", "jaco")),
     *([PAPER_EXPLORATION, f"paper/urlb/{domain}"] for domain in ("quadruped", "jaco")),
+    *([ATARI, name] for name in ("bottleneck/none", "bottleneck/vib", "bottleneck/vq", "demo_atari")),
+    *([ATARI, f"atari/{game}"] for game in GAMES),
+    *([PAPER_ATARI, f"paper/atari/{game}"] for game in GAMES),
 ]
 FEW_FRAMES = ["--data.frames", "5000", "--data.seed_frames", "1000", "--data.snapshots", "[]",
               "--data.action_repeat", "25", "--data.image_size", "32", "--data.processes", "false",
@@ -135,6 +151,8 @@ FEW_FRAMES = ["--data.frames", "5000", "--data.seed_frames", "1000", "--data.sna
 EXPLORED_AT_ONCE = ["--data.frames", "20500", "--data.snapshots", "[20000]", "--data.action_repeat", "125",
                     "--data.image_size", "32", "--data.batch_size", "4", "--data.processes", "false",
                     "--data.seed_frames", "19000"]  # fmt: skip
+SMALL_DT = ["--layers", "1", "--heads", "1", "--width", "8", "--batch_size", "8", "--episodes", "2", "--film", "1",
+            "--steps_per_epoch", "2"]  # fmt: skip
 ON_A_CPU = ["--trainer.accelerator", "cpu", "--trainer.precision", "32-true"]
 
 
@@ -142,6 +160,7 @@ ON_A_CPU = ["--trainer.accelerator", "cpu", "--trainer.precision", "32-true"]
 def test_every_configuration_trains(here, layers):
     configurations = [argument for name in layers for argument in ("--config", name)]
     small = [*SMALL, *FEW_FRAMES] if "urlb/" in layers[0] else SMALL
+    small = [*small, "--data.workers", "0"] if layers[0] == PAPER_ATARI else small
     assert main(["fit", *configurations, *small, *ON_A_CPU, "--run", "runs/x"]) == 0
     assert Path("runs/x/checkpoints/step-00000003.ckpt").is_file()
     written = {path.name for path in Path("runs/x").iterdir()}
@@ -230,6 +249,8 @@ def test_every_command_of_the_readme(here, monkeypatch):
             small = ["--steps", "60", "--learning_starts", "30", "--evaluate_every", "30"]
         elif command[:2] in (["finetune", "ddpg"], ["finetune", "sac"]):
             small = ["--frames", "3000", "--seed_frames", "1000", "--batch_size", "4", "--episodes", "2"]
+        elif command[:2] == ["finetune", "dt"]:
+            small = [*SMALL_DT, "--epochs", "1"]
         elif command[0] == "finetune":
             small = ["--steps", "10", "--hidden", "32", "--batch_size", "16", "--episodes", "2"]
         if command[:2] == ["collect", "control"]:
@@ -382,6 +403,33 @@ def test_the_suite_of_exploration(here, capsys):
     written = {path.name for path in Path("results/urlb").iterdir()}
     figures = {f"{grid}-snapshots-walker_walk-eval-return.png" for grid in plan["grids"]}
     assert {"report.md", "report.html", "walker-curves.png", "walker-values-walker_walk.png", *figures} <= written
+
+
+def test_the_suite_of_atari(here, capsys):
+    """The packaged suite with two numbers of groups, few steps and one seed."""
+    plan = yaml.safe_load(packaged_suites()["atari"].read_text())
+    few = {
+        key.removeprefix("--"): yaml.safe_load(value) for key, value in zip(SMALL_DT[::2], SMALL_DT[1::2], strict=True)
+    }
+    plan["finetune"]["with"] = {**few, "epochs": 1}
+    words = [*SMALL, *QUANTISER_AT_ONCE, "--trainer.log_every_n_steps", "1"]
+    small = {key.removeprefix("--"): yaml.safe_load(value) for key, value in zip(words[::2], words[1::2], strict=True)}
+    small.pop("trainer.enable_progress_bar")
+    fewer = {**small, "model.bottleneck.init_args.groups": 4}
+    plan["grids"] = {
+        "breakout": {"settings": {"repdib": small}},
+        "groups": {"settings": {"groups_4": fewer, "repdib": small}},
+    }
+    plan["headline"] = {"Breakout": {"grid": "breakout", "measure": "dt/game/return", "paper": {"repdib": 41.8}}}
+    plan["claims"] = {text: claim for text, claim in plan["claims"].items() if claim.get("grid") == "groups"}
+    plan |= {"seeds": [0], "collect": None, "probe_collect": None, "films": ["breakout/repdib"]}
+    Path("atari.yaml").write_text(yaml.safe_dump(plan))
+    for command in suite_commands("atari"):
+        assert main([*command[:2], "atari.yaml"]) == 0
+        assert "2 finished of 2" in capsys.readouterr().out or command[1] == "report"
+    written = {path.name for path in Path("results/atari").iterdir()}
+    figures = {"against-groups.png", "overview-dt-game-normalised.png", "film-breakout-repdib-game.mp4"}
+    assert {"report.md", "report.html", "films.png", *figures} <= written
 
 
 @pytest.mark.parametrize("name", packaged_suites())
