@@ -28,6 +28,7 @@ COMMANDS = {
     "offline_run": ["offline_run"],
     "exploration": ["exploration"],
     "replay": ["replay"],
+    "decision_transformer": ["decision_transformer"],
 }
 ON = {
     "cpu": [
@@ -41,6 +42,7 @@ ON = {
         "offline_agents",
         "exploration",
         "replay",
+        "decision_transformer",
     ],
     "cuda": ["quantiser", "data_path", "training_step", "encoding", "offline_run"],
 }

@@ -13,14 +13,22 @@ ARM = {"front": (3, 64, 64), "top": (3, 64, 64)}
 OFFLINE = {"pixels": (3, 84, 84)}
 
 
-def write(path: Path, views: dict[str, tuple[int, ...]], actions: ActionSpec, rows: int, episode: int = 500) -> Path:
+def write(
+    path: Path,
+    views: dict[str, tuple[int, ...]],
+    actions: ActionSpec,
+    rows: int,
+    episode: int = 500,
+    *,
+    rewards: bool = False,
+) -> Path:
     """Write ``rows`` rows in episodes of about ``episode`` rows, every fifth of which is for evaluation."""
     generator = np.random.default_rng(0)
     noise = {name: generator.integers(0, 256, (episode, *shape), np.uint8) for name, shape in views.items()}
     lengths = [episode] * (rows // episode)
     observations = {name: ArraySpec(shape) for name, shape in views.items()}
     with EpisodeWriter(
-        path, rows=sum(lengths), episodes=len(lengths), observations=observations, actions=actions
+        path, rows=sum(lengths), episodes=len(lengths), observations=observations, actions=actions, rewards=rewards
     ) as writer:
         for number, length in enumerate(lengths):
             steps = length - 1
@@ -29,5 +37,13 @@ def write(path: Path, views: dict[str, tuple[int, ...]], actions: ActionSpec, ro
                 if actions.kind == "discrete"
                 else generator.uniform(-1, 1, (steps, actions.size)).astype(np.float32)
             )
-            writer.add_episode(observations=noise, actions=taken, evaluation=number % 5 == 4)
+            told = {}
+            if rewards:
+                ended = np.arange(steps) == steps - 1
+                told = {
+                    "rewards": np.ones(steps, np.float32),
+                    "terminations": ended,
+                    "truncations": np.zeros(steps, bool),
+                }
+            writer.add_episode(observations=noise, actions=taken, evaluation=number % 5 == 4, **told)
     return path

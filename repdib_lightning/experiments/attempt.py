@@ -16,6 +16,8 @@ from repdib_lightning.callbacks.status_file import read_status
 from repdib_lightning.errors import UserError
 from repdib_lightning.experiments.measures import collect_measures
 from repdib_lightning.experiments.points import OUTCOME, PROBE_FILE, SAMPLES_FILE, Point, Record
+from repdib_lightning.rl import RESUMABLE
+from repdib_lightning.rl.options import CONFIGURATION
 
 DEPENDENT = {
     "fit": ("fit", "export", "probe", "finetune"),
@@ -86,7 +88,6 @@ class Attempt:
     def _phase(self, phase: str, record: Record, handle: int) -> None:
         if phase == "finetune":
             for name in self.point.unfinished_finetunings():
-                shutil.rmtree(self.point.finetune_folder(name), ignore_errors=True)  # one that was ended cannot go on
                 self._timed(phase, self._finetune_options(name), record, handle, f" {name}")
         elif not self._is_done(phase):
             self._timed(phase, self._options(phase), record, handle)
@@ -122,9 +123,13 @@ class Attempt:
         return [run, str(self.point.setting.probed_on), *kept, *chosen]
 
     def _finetune_options(self, name: str) -> list[str]:
-        given = self.point.encoder_of(name)
+        given, folder = self.point.encoder_of(name), self.point.finetune_folder(name)
         encoder = [] if given is None else ["--encoder", str(given)]
-        return [*self.point.finetune[name], *encoder, "--run", str(self.point.finetune_folder(name))]
+        agent = self.point.finetune[name][0]
+        resume = ["--resume", "true"] if agent in RESUMABLE and (folder / CONFIGURATION).is_file() else []
+        if not resume:
+            shutil.rmtree(folder, ignore_errors=True)  # what was ended, and cannot go on
+        return [*self.point.finetune[name], *encoder, "--run", str(folder), *resume]
 
     def _command(self, words: list[str], handle: int) -> tuple[int, str]:
         """Run one command; its output goes to the point's log. Returns the exit code and the last line it printed."""

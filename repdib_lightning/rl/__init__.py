@@ -23,6 +23,9 @@ CHECKS = {
 """Agent -> ``module:function`` that takes the same options and raises UserError for what is wrong with them, as far as
 that can be known without a bundle and before anything runs."""
 
+RESUMABLE = ("dt",)
+"""Agents whose ``finetune`` takes ``--resume``."""
+
 FRESH_OPTIONS = ("features", "channels", "strides", "frame_stack")
 """Options of a fresh encoder, which mean nothing beside one that is given."""
 

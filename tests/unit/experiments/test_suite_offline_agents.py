@@ -1,7 +1,9 @@
 """Suites of agents that learn from data, grids with fewer seeds, and films in the report."""
 
+import inspect
 import json
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from finished_points import finish, typical
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.errors import UserError
 from repdib_lightning.experiments import headline
+from repdib_lightning.experiments.attempt import Attempt
 from repdib_lightning.experiments.film_part import frames_of
 from repdib_lightning.experiments.measures import collect_measures
 from repdib_lightning.experiments.points import points_of
@@ -21,6 +24,7 @@ from repdib_lightning.experiments.report import report_suite
 from repdib_lightning.experiments.results import load_results
 from repdib_lightning.experiments.run import check_recorded_as
 from repdib_lightning.experiments.suite_file import read_suite
+from repdib_lightning.rl import AGENTS, RESUMABLE
 from repdib_lightning.rl.film import side_by_side, write_film
 
 AGENT = {"agent": "td3bc", "with": {"steps": 200}, "runs": {"walk": None, "far": {"gamma": 0.9}}}
@@ -51,6 +55,27 @@ def test_an_agent_that_learns_from_data_is_given_its_grids_store_and_needs_no_en
     assert scratch.data == Path("data/a.h5") and scratch.phases == ("finetune",)
     with pytest.raises(UserError, match="'data' follows from the suite's seeds and runs"):
         read_suite(write(tmp_path, finetune={**AGENT, "with": {"data": "data/c.h5"}}))
+
+
+@pytest.mark.parametrize(("agent", "goes_on"), [("td3bc", False), ("dt", True)])
+def test_a_fine_tuning_that_was_ended_goes_on_where_its_agent_can(tmp_path, agent, goes_on):
+    suite = read_suite(write(tmp_path, finetune={"agent": agent, "runs": {"walk": None}}))
+    (point,) = points_of(suite, [0], tmp_path, ["head/none"])
+    folder = point.finetune_folder("walk")
+    assert Attempt(point)._finetune_options("walk")[-2:] == ["--run", str(folder)]
+    folder.mkdir(parents=True)
+    (folder / "checkpoint").touch()
+    assert Attempt(point)._finetune_options("walk")[-2:] == ["--run", str(folder)] and not folder.exists()
+    folder.mkdir()
+    (folder / "finetune.json").write_text("{}")
+    resumed = Attempt(point)._finetune_options("walk")[-2:] == ["--resume", "true"]
+    assert resumed == folder.exists() == goes_on
+
+
+def test_the_agents_that_can_go_on_are_those_that_take_the_option():
+    functions = {name: place.split(":") for name, place in AGENTS.items()}
+    taken = {name: inspect.signature(getattr(import_module(m), f)).parameters for name, (m, f) in functions.items()}
+    assert set(RESUMABLE) == {name for name, parameters in taken.items() if "resume" in parameters}
 
 
 def test_a_grid_may_have_fewer_seeds_and_a_setting_of_two_grids_has_those_of_both(tmp_path):
