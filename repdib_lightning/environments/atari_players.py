@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # torch is loaded only where a network plays
 NETWORK_EPSILON = 0.05
 """Share of a network's actions that are drawn at random; as in Mnih et al. (2015)."""
 
-SCRIPTED_MIXTURE = {"random": 0.1, "scripted-0.3": 0.4, "scripted-0.1": 0.3, "scripted-0.02": 0.2}
+SCRIPTED_MIXTURE = {"random": 0.1, "scripted-0.3": 0.2, "scripted-0.1": 0.3, "scripted-0.02": 0.4}
 """Who plays which share of the samples of a game that has a script, where nothing else is said."""
 
 _KINDS = ("random", "scripted-EPSILON", "dqn", "dqn-STEPS")

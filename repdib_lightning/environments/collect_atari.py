@@ -60,8 +60,8 @@ def collect_atari(
         mixture: who plays which share of the samples, such as ``'{random: 0.2, scripted-0.3: 0.8}'``. ``random``;
             ``scripted-EPSILON`` (Breakout, Pong, Qbert and Seaquest: reads the console's memory, that share of its
             actions is random); ``dqn`` or ``dqn-STEPS`` (the newest network of the policy, or that of an age; 0.05 of
-            its actions are random). By default ``random: 0.1, scripted-0.3: 0.4, scripted-0.1: 0.3, scripted-0.02:
-            0.2``; random alone where there is no script; all networks of the policy where there is one.
+            its actions are random). By default ``random: 0.1, scripted-0.3: 0.2, scripted-0.1: 0.3, scripted-0.02:
+            0.4``; random alone where there is no script; all networks of the policy where there is one.
         policy: file of networks (``collect atari_policy``).
         sticky: probability that the console repeats the action before, each emulator frame.
         frame_skip: emulator frames an action is held for.
