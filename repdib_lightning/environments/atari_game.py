@@ -53,6 +53,7 @@ class AtariGame:
         self._noop_max = noop_max
         self._settings = {"repeat_action_probability": float(sticky), "max_num_frames_per_episode": max_frames}
         self._console = loaded(self.name, **self._settings)
+        self._switched_on = self._console.cloneState()
         self._codes = self._console.getMinimalActionSet()
         self.actions = len(self._codes)
         self._sticky = sticky
@@ -66,6 +67,8 @@ class AtariGame:
         if self._sticky:  # the console takes a seed only with a cartridge, and nothing else in it depends on chance
             seed = int(sticking.integers(2**31 - 1))
             self._console = loaded(self.name, random_seed=seed, **self._settings)
+        else:  # the reset button does not clear all of a console: Seaquest goes another way after another game
+            self._console.restoreState(self._switched_on)
         count = int(noops.integers(1, self._noop_max + 1)) if self._noop_max else 0
         self._console.reset_game()
         for _ in range(count):

@@ -78,6 +78,27 @@ def test_noops_and_sticky_actions_are_decided_by_their_own_seeds():
     assert not np.array_equal(memories(begun(plain, 5, 1)), memories(begun(plain, 6, 1)))
 
 
+@pytest.mark.parametrize("name", ["breakout", "pong", "qbert", "seaquest"])
+def test_a_game_does_not_depend_on_those_that_were_played_before(name):
+    """Seaquest's would: its console keeps something over a reset."""
+    used = made(name)
+    plans = [np.random.default_rng(seed).integers(used.actions, size=600) for seed in range(4)]
+
+    def played(game: AtariGame, number: int) -> list[bytes]:
+        begun(game, noops=number)
+        seen = []
+        for action in plans[number]:
+            if game.over:
+                break
+            game.step(int(action))
+            seen.append(game.ram().tobytes())
+        return seen
+
+    together = [played(used, number) for number in range(4)]
+    for number in (1, 3):
+        assert together[number] == played(made(name), number)
+
+
 @pytest.mark.parametrize(("sticky", "least", "most"), [(0.0, 0.0, 0.0), (0.4, 0.25, 0.55)])
 def test_a_tap_is_lost_as_often_as_actions_stick(sticky, least, most):
     """The paddle stays where the frame of the tap repeats the action before, which was none."""
