@@ -48,7 +48,7 @@ def _child(folder: str, arguments: list[str], environment: dict[str, str]) -> No
 
 def command(folder: Path, *arguments: str) -> int:
     """Run ``python -m repdib_lightning ARGUMENTS`` in a folder; return its exit code (negative: killed)."""
-    return _join([_start(folder, arguments, {})])[0]
+    return _join([start(folder, arguments, {})])[0]
 
 
 def command_in_processes(count: int, folder: Path, *arguments: str) -> list[int]:
@@ -59,10 +59,11 @@ def command_in_processes(count: int, folder: Path, *arguments: str) -> list[int]
     shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "TORCHELASTIC_RUN_ID": "test"}
     sizes = {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count), "GROUP_RANK": "0"}
     ranks = [{"RANK": str(rank), "LOCAL_RANK": str(rank)} for rank in range(count)]
-    return _join([_start(folder, arguments, {**shared, **sizes, **rank}) for rank in ranks])
+    return _join([start(folder, arguments, {**shared, **sizes, **rank}) for rank in ranks])
 
 
-def _start(folder: Path, arguments: Sequence[str], environment: dict[str, str]) -> Any:
+def start(folder: Path, arguments: Sequence[str], environment: dict[str, str]) -> Any:
+    """The same without waiting: the process."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["repdib_lightning.cli", "killing"])
     process = context.Process(target=_child, args=(str(folder), list(arguments), environment))
