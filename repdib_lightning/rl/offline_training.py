@@ -30,13 +30,13 @@ from repdib_lightning.export.load import load_encoder
 from repdib_lightning.records import DataSpec
 from repdib_lightning.rl.devices import check_device
 from repdib_lightning.rl.episodes_at_once import EpisodesAtOnce
-from repdib_lightning.rl.film import side_by_side, write_film
 from repdib_lightning.rl.given_bundle import checked_bundle
 from repdib_lightning.rl.networks import ShiftedPictures, StandardisedLatents
 from repdib_lightning.rl.offline_environment import evaluated_environment, open_all
 from repdib_lightning.rl.offline_options import OfflineOptions
 from repdib_lightning.rl.offline_progress import OfflineProgress
-from repdib_lightning.rl.options import CONFIGURATION, FILM, OUTCOME, plain
+from repdib_lightning.rl.options import CONFIGURATION, plain
+from repdib_lightning.rl.outcome import write_outcome
 from repdib_lightning.rl.policy_file import save_policy
 from repdib_lightning.rl.row_sources import Latents, Pictures
 from repdib_lightning.rl.td3_bc import TD3BC, BehaviourCloning
@@ -192,10 +192,7 @@ class OfflineTraining:
             "measures": measures,
             "maps": {},
         }
-        with whole_file(folder / OUTCOME) as path:
-            path.write_text(json.dumps(outcome, indent=1, allow_nan=False) + "\n")
-        if self.films:  # last, so that nothing is lost where it cannot be written
-            write_film(folder / FILM, side_by_side(self.films))
+        write_outcome(folder, outcome, self.films)
         return outcome
 
     def close(self) -> None:

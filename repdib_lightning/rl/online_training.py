@@ -25,7 +25,6 @@ from repdib_lightning.export.gymnasium_wrapper import PrepareObservation
 from repdib_lightning.rl.devices import check_device
 from repdib_lightning.rl.episodes_at_once import EpisodesAtOnce
 from repdib_lightning.rl.exploration.schedule import Schedule
-from repdib_lightning.rl.film import side_by_side, write_film
 from repdib_lightning.rl.last_good import Spoiled, told
 from repdib_lightning.rl.offline_environment import CONTROL
 from repdib_lightning.rl.offline_options import FRESH
@@ -34,7 +33,8 @@ from repdib_lightning.rl.online_environment import chosen_options, control_of, o
 from repdib_lightning.rl.online_options import OnlineOptions
 from repdib_lightning.rl.online_progress import OnlineProgress
 from repdib_lightning.rl.online_values import VALUES, SeenValues
-from repdib_lightning.rl.options import CONFIGURATION, FILM, OUTCOME, plain
+from repdib_lightning.rl.options import CONFIGURATION, plain
+from repdib_lightning.rl.outcome import write_outcome
 from repdib_lightning.versions import versions
 
 
@@ -244,10 +244,7 @@ class OnlineTraining(ABC):
             },
             "maps": {},
         }
-        with whole_file(folder / OUTCOME) as path:
-            path.write_text(json.dumps(outcome, indent=1, allow_nan=False) + "\n")
-        if self.films:  # last, so that nothing is lost where it cannot be written
-            write_film(folder / FILM, side_by_side(self.films))
+        write_outcome(folder, outcome, self.films)
         return outcome
 
     def close(self) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +22,8 @@ from repdib_lightning.rl.networks import Actor, StandardisedLatents
 from repdib_lightning.rl.offline_options import OfflineOptions
 
 POLICY = "policy.safetensors"
+
+T = TypeVar("T")
 
 
 class OfflinePolicy:
@@ -60,26 +64,50 @@ def load_policy(folder: str | Path, encoder: str | Path | None = None) -> Offlin
     Raises:
         UserError: no such run or bundle, a damaged file, or a bundle of another width.
     """
-    path = Path(folder) / POLICY
-    if not path.is_file():
-        raise UserError(f"{folder}: holds no {POLICY}; name the folder of a finished run of finetune td3bc or bc")
-    try:
-        with safe_open(path, framework="pt") as file:
-            facts = json.loads((file.metadata() or {})["policy"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
-        trained_on, standardise, actor = facts["encoder"], *_rebuilt(tensors)
-    except (SafetensorError, KeyError, ValueError, OSError, RuntimeError, TypeError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"{path}: not a policy of finetune td3bc or bc ({type(error).__name__}: {reason})") from error
-    own = Path(folder) / "bundle"
-    if encoder is None and trained_on is None and not own.is_dir():
-        raise UserError(f"{folder}: its encoder, {own}, is missing; put it back, or name one")
-    named = Path(encoder or (trained_on if trained_on is not None else own))
-    bundle = named / "bundle" if (named / "bundle").is_dir() else named
+    trained_on, (standardise, actor) = read_policy(
+        Path(folder), "td3bc or bc", lambda facts, tensors: (facts["encoder"], _rebuilt(tensors))
+    )
+    bundle = bundle_of_policy(Path(folder), trained_on, encoder)
     frozen = load_encoder(bundle)
     if frozen.features != actor.features:
         raise UserError(f"{bundle}: gives {frozen.features} features, the policy in {folder} takes {actor.features}")
     return OfflinePolicy(frozen, standardise, actor)
+
+
+def read_policy(folder: Path, agents: str, rebuild: Callable[[Any, dict[str, Tensor]], T]) -> T:
+    """Read a run's ``policy.safetensors``.
+
+    Args:
+        folder: of the run. agents: who writes such a file, for messages.
+        rebuild: what to make of its facts and tensors; it may raise what a dictionary or torch raises.
+
+    Raises:
+        UserError: no such run, or a file that ``rebuild`` can make nothing of.
+    """
+    path = folder / POLICY
+    if not path.is_file():
+        raise UserError(f"{folder}: holds no {POLICY}; name the folder of a finished run of finetune {agents}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            facts = json.loads((file.metadata() or {})["policy"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
+        return rebuild(facts, tensors)
+    except (SafetensorError, KeyError, ValueError, OSError, RuntimeError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{path}: not a policy of finetune {agents} ({type(error).__name__}: {reason})") from error
+
+
+def bundle_of_policy(folder: Path, trained_on: str | None, given: str | Path | None) -> Path:
+    """The encoder of a run's policy: the given one, else the one that it was trained on, else the run's own.
+
+    Raises:
+        UserError: the run should have one, and has not.
+    """
+    own = folder / "bundle"
+    if given is None and trained_on is None and not own.is_dir():
+        raise UserError(f"{folder}: its encoder, {own}, is missing; put it back, or name one")
+    named = Path(given or (trained_on if trained_on is not None else own))
+    return named / "bundle" if (named / "bundle").is_dir() else named
 
 
 def _rebuilt(tensors: dict[str, Tensor]) -> tuple[nn.Module, Actor]:

@@ -27,7 +27,8 @@ from repdib_lightning.rl.environment import check_discrete, maze_of, open_enviro
 from repdib_lightning.rl.evaluation import EpisodeEvaluation, MazeEvaluation
 from repdib_lightning.rl.features import BottleneckFeatures
 from repdib_lightning.rl.given_bundle import checked_bundle
-from repdib_lightning.rl.options import CONFIGURATION, FRESH, OUTCOME, DQNOptions, plain
+from repdib_lightning.rl.options import CONFIGURATION, FRESH, DQNOptions, plain
+from repdib_lightning.rl.outcome import write_outcome
 from repdib_lightning.rl.progress import POLICY, Progress
 from repdib_lightning.rl.visits import CountVisits
 from repdib_lightning.versions import versions
@@ -167,8 +168,7 @@ class Training:
             "measures": measures,
             "maps": maps,
         }
-        with whole_file(folder / OUTCOME) as path:
-            path.write_text(json.dumps(outcome, indent=1, allow_nan=False) + "\n")
+        write_outcome(folder, outcome)
         return outcome
 
     def _best_encoder(self, folder: Path) -> FrozenEncoder:

@@ -14,6 +14,7 @@ import numpy as np
 
 from repdib_lightning.data.importers.dqn_replay_arrays import ArrayStream
 from repdib_lightning.errors import UserError
+from repdib_lightning.word_lists import in_ranges
 
 FOLDER = "replay_logs"
 ARRAYS = ("observation", "action", "reward", "terminal")
@@ -146,17 +147,6 @@ class ReplayLogs:
                 raise UserError(f"{path}: is {stream.dtype} of shape {stream.shape}, must be one whole number")
             added = int(stream.read_all().reshape(-1)[0])
         return added % length or length if length else 0
-
-
-def in_ranges(numbers: list[int]) -> str:
-    """Numbers in words: 0, 1, 2, 7 is ``0-2, 7``; none is ``none``."""
-    runs: list[list[int]] = []
-    for number in sorted(numbers):
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    return ", ".join(str(low) if low == high else f"{low}-{high}" for low, high in runs) or "none"
 
 
 def _find_folder(source: Path) -> Path:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from repdib_lightning.data.importers.dqn_replay_files import in_ranges
 from repdib_lightning.data.importers.dqn_replay_selection import Piece
+from repdib_lightning.word_lists import in_ranges
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from pathlib import Path
 from repdib_lightning.data.files import whole_file
 from repdib_lightning.data.importers.mmact_clips import Clip, Form
 from repdib_lightning.data.importers.mmact_notes import Note
-from repdib_lightning.data.importers.mmact_splits import HELD_OUT, Split, in_ranges
+from repdib_lightning.data.importers.mmact_splits import HELD_OUT, Split
+from repdib_lightning.word_lists import in_ranges
 
 _MOST_LINES = 20
 _COUNTED = {"skipped": "files skipped", "broken": "videos broken", "short": "videos short", "left out": "left out"}

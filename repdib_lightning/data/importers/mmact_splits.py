@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 from repdib_lightning.data.importers.mmact_clips import Clip
 from repdib_lightning.errors import UserError
+from repdib_lightning.word_lists import in_ranges
 
 Split = Literal["cross_subject", "cross_session", "cross_scene", "cross_view", "none"]
 HELD_OUT: dict[str, tuple[str, frozenset[int]]] = {
@@ -47,14 +48,3 @@ def _possible(clips: Sequence[Clip]) -> list[str]:
         if found & values and not found <= values:
             names.append(split)
     return [*names, "none"]
-
-
-def in_ranges(numbers: Iterable[int]) -> str:
-    """``1-3, 5`` of 1, 2, 3 and 5."""
-    runs: list[list[int]] = []
-    for number in sorted(numbers):
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)

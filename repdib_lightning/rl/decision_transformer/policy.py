@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -21,7 +20,7 @@ from repdib_lightning.export.observations import Observations
 from repdib_lightning.rl.decision_transformer.network import DecisionTransformer, Sizes
 from repdib_lightning.rl.decision_transformer.play import Play
 from repdib_lightning.rl.decision_transformer.states import CodeStates, EncodedStates, LatentStates
-from repdib_lightning.rl.policy_file import POLICY
+from repdib_lightning.rl.policy_file import POLICY, bundle_of_policy, read_policy
 
 
 class DecisionTransformerPolicy:
@@ -101,23 +100,12 @@ def load_decision_transformer(
     Raises:
         UserError: no such run or bundle, a damaged file, or a bundle that gives something else.
     """
-    path = Path(folder) / POLICY
-    if not path.is_file():
-        raise UserError(f"{folder}: holds no {POLICY}; name the folder of a finished run of finetune dt")
-    try:
-        with safe_open(path, framework="pt") as file:
-            facts = json.loads((file.metadata() or {})["policy"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
-        trained_on, network = facts["encoder"], _rebuilt(facts, tensors)
-        acts = (float(facts["target_return"]), float(facts["temperature"]))
-    except (SafetensorError, KeyError, ValueError, OSError, RuntimeError, TypeError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"{path}: not a policy of finetune dt ({type(error).__name__}: {reason})") from error
-    own = Path(folder) / "bundle"
-    if encoder is None and trained_on is None and not own.is_dir():
-        raise UserError(f"{folder}: its encoder, {own}, is missing; put it back, or name one")
-    named = Path(encoder or (trained_on if trained_on is not None else own))
-    bundle = named / "bundle" if (named / "bundle").is_dir() else named
+
+    def rebuild(facts: Any, tensors: dict[str, Tensor]) -> tuple[str | None, DecisionTransformer, float, float]:
+        return facts["encoder"], _rebuilt(facts, tensors), float(facts["target_return"]), float(facts["temperature"])
+
+    trained_on, network, *acts = read_policy(Path(folder), "dt", rebuild)
+    bundle = bundle_of_policy(Path(folder), trained_on, encoder)
     frozen = load_encoder(bundle)
     _check_fits(bundle, frozen, Path(folder), network)
     chosen = resolve_device(device)

@@ -42,10 +42,10 @@ from repdib_lightning.rl.decision_transformer.progress import EpochProgress
 from repdib_lightning.rl.decision_transformer.states import CodeStates, EncodedStates, LatentStates
 from repdib_lightning.rl.decision_transformer.windows import WindowOrder, Windows
 from repdib_lightning.rl.devices import check_device
-from repdib_lightning.rl.film import side_by_side, write_film
 from repdib_lightning.rl.given_bundle import checked_bundle
 from repdib_lightning.rl.offline_environment import evaluated_environment, open_discrete
-from repdib_lightning.rl.options import CONFIGURATION, FILM, OUTCOME, plain
+from repdib_lightning.rl.options import CONFIGURATION, plain
+from repdib_lightning.rl.outcome import write_outcome
 from repdib_lightning.versions import versions
 
 LATENTS = "latents.h5"
@@ -260,10 +260,7 @@ class DTTraining:
             "measures": self.progress.measures,
             "maps": {},
         }
-        with whole_file(folder / OUTCOME) as path:
-            path.write_text(json.dumps(outcome, indent=1, allow_nan=False) + "\n")
-        if self.films:  # last, so that nothing is lost where it cannot be written
-            write_film(folder / FILM, side_by_side(self.films))
+        write_outcome(folder, outcome, self.films)
         return outcome
 
     def close(self) -> None:

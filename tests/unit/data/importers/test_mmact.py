@@ -14,8 +14,8 @@ from repdib_lightning.__main__ import main
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.data.importers.mmact_activities import CLASSES
 from repdib_lightning.data.importers.mmact_sensors import read_stream, resample
-from repdib_lightning.data.importers.mmact_splits import in_ranges
 from repdib_lightning.data.importers.mmact_videos import places, read_film
+from repdib_lightning.word_lists import in_ranges
 
 
 @pytest.fixture
