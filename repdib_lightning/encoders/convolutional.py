@@ -51,11 +51,13 @@ class ConvolutionalEncoder(Encoder):
         strides = [2, 1, 1, 1] if strides is None else strides
         kernels = [3] * len(strides) if kernels is None else kernels
         widths = [channels] * len(strides) if isinstance(channels, int) else channels
-        if not len(widths) == len(kernels) == len(strides) or min([*widths, *kernels, *strides], default=0) < 1:
-            raise UserError(
-                f"ConvolutionalEncoder: channels ({channels}), strides ({strides}) and kernels ({kernels}) must be at "
-                "least 1, and lists equally long"
-            )
+        sizes = {"channels": widths, "strides": strides, "kernels": kernels}
+        for name, values in sizes.items():
+            if min(values, default=0) < 1:
+                raise UserError(f"ConvolutionalEncoder: {name} ({values}) must be at least 1")
+        if len({len(values) for values in sizes.values()}) > 1:
+            told = ", ".join(f"{name} ({values})" for name, values in sizes.items())
+            raise UserError(f"ConvolutionalEncoder: {told} must be lists equally long")
         self.means = nn.ModuleDict()
         self.stacks = nn.ModuleDict()
         width = 0
@@ -101,9 +103,11 @@ def flat_width(stack: nn.Sequential, view: str, shape: tuple[int, ...]) -> int:
             stride, kernel, channels = layer.stride[0], layer.kernel_size[0], layer.out_channels
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
         if height < 1 or width < 1:
-            raise UserError(
-                f"ConvolutionalEncoder: '{view}' of {shape[1]}x{shape[2]} pixels is too small for its convolutions"
+            convolutions = [layer for layer in stack if isinstance(layer, nn.Conv2d)]
+            sizes = (
+                f"strides {[c.stride[0] for c in convolutions]} of kernels {[c.kernel_size[0] for c in convolutions]}"
             )
+            raise UserError(f"ConvolutionalEncoder: '{view}' of {shape[1]}x{shape[2]} pixels is too small for {sizes}")
     return channels * height * width
 
 

@@ -86,15 +86,24 @@ def test_the_convolutions_of_dqn_have_its_sizes():
 
 
 @pytest.mark.parametrize(
-    "sizes", [{"channels": [8, 8]}, {"kernels": [3]}, {"kernels": [3, 3, 3, 0]}, {"channels": 0}, {"strides": []}]
+    ("sizes", "said"),
+    [
+        ({"channels": [8, 8]}, r"channels \(\[8, 8\]\), strides \(\[2, 1, 1, 1\]\), kernels .* equally long"),
+        ({"kernels": [3]}, r"channels .*, strides .*, kernels \(\[3\]\) must be lists equally long"),
+        ({"kernels": [3, 3, 3, 0]}, r"kernels \(\[3, 3, 3, 0\]\) must be at least 1"),
+        ({"channels": 0}, r"channels \(\[0, 0, 0, 0\]\) must be at least 1"),
+        ({"strides": []}, r"strides \(\[\]\) must be at least 1"),
+    ],
 )
-def test_sizes_of_convolutions_that_do_not_fit_together_are_named(sizes):
-    with pytest.raises(UserError, match=r"channels .* strides .* and kernels .* equally long"):
+def test_sizes_of_convolutions_that_do_not_fit_together_are_named(sizes, said):
+    with pytest.raises(UserError, match=f"ConvolutionalEncoder: {said}"):
         ConvolutionalEncoder(SPECS["one view"], **sizes)
 
 
 def test_a_picture_too_small_for_the_strides():
-    with pytest.raises(UserError, match="'eye' of 12x12 pixels is too small"):
+    with pytest.raises(
+        UserError, match=r"'eye' of 12x12 pixels is too small for strides \[2, 2, 2\] of kernels \[3, 3, 3\]"
+    ):
         ConvolutionalEncoder(DataSpec({"eye": ArraySpec((3, 12, 12))}), strides=[2, 2, 2])
 
 
