@@ -52,9 +52,9 @@ class ConvolutionalEncoder(Encoder):
         kernels = [3] * len(strides) if kernels is None else kernels
         widths = [channels] * len(strides) if isinstance(channels, int) else channels
         sizes = {"channels": widths, "strides": strides, "kernels": kernels}
-        for name, values in sizes.items():
-            if min(values, default=0) < 1:
-                raise UserError(f"ConvolutionalEncoder: {name} ({values}) must be at least 1")
+        for name in ("strides", "kernels", "channels"):
+            if min(sizes[name], default=0) < 1:
+                raise UserError(f"ConvolutionalEncoder: {name} ({sizes[name]}) must be at least 1")
         if len({len(values) for values in sizes.values()}) > 1:
             told = ", ".join(f"{name} ({values})" for name, values in sizes.items())
             raise UserError(f"ConvolutionalEncoder: {told} must be lists equally long")
