@@ -40,16 +40,24 @@ def one_line(error: BaseException, options: Iterable[str], classes: dict[str, li
         choices = re.findall(r"'([^']*)'", match[1])
         return UserError(f"{key}: unknown '{match[2]}', {nearest(match[2], choices)}")
     if match := re.search(r"Expected an? (?:<class ')?([\w.]+)'?>?\. Got value: (.*)", text):
-        return UserError(f"{key}: expected {match[1]}, got '{match[2].split(' Got value')[0].strip().rstrip('.')}'")
+        return _of_another_kind(key, match[1], match[2].split(" Got value")[0].strip().rstrip("."))
     plain = re.search(r"Subtypes: \[((?:<class '(?:int|float|str|bool|NoneType)'>(?:, )?)+)\]", text)
     given = re.search(r"Given value: (.*)", text)
     if plain and given:
         kinds = re.findall(r"'(\w+)'", plain[1])
         wanted = " or ".join(kind for kind in kinds if kind != "NoneType")
-        return UserError(f"{key}: expected {wanted}, got '{given[1]}'")
+        return _of_another_kind(key, wanted, given[1])
+    if given and (pairs := re.search(r"Subtypes: \[dict\[(\w+), (\w+)\].*<class 'dict'>", text, re.DOTALL)):
+        return UserError(f"{key}: expected pairs '{{{pairs[1]}: {pairs[2]}}}', got '{given[1]}'")
     if match := re.search(r"(?:Errors:\s*|expects a function or a callable class: )-? ?(.+)", text):
         return UserError(_unwrap(match[1]) if not keys else f"{key}: {_unwrap(match[1])}")
     return UserError(f"{key}: {_unwrap(text)}" if key and key not in text.splitlines()[-1] else _unwrap(text))
+
+
+def _of_another_kind(key: str, wanted: str, given: str) -> UserError:
+    if wanted == "float" and given.lower().lstrip("+-") in ("nan", "inf", "infinity"):
+        return UserError(f"{key}: must be a finite number, is {given}")
+    return UserError(f"{key}: expected {wanted}, got '{given}'")
 
 
 def _join(keys: list[str]) -> str:
