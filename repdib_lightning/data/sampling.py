@@ -82,7 +82,7 @@ class FutureSampling:
             raise UserError(_empty_split(store, split))
         short = episodes[store.lengths[episodes] <= ahead]
         if len(short) and not (leave_out_short and len(short) < len(episodes)):
-            raise UserError(_too_short(store, episodes, int(short[0]), ahead, next_frame=next_frame))
+            raise UserError(_too_short(store, episodes, short, ahead, left_out=leave_out_short, next_frame=next_frame))
         self.left_out = len(short)
         episodes = np.setdiff1d(episodes, short, assume_unique=True)
         spans = [np.arange(store.starts[e], store.starts[e] + store.lengths[e] - ahead) for e in episodes]
@@ -147,14 +147,19 @@ def _empty_split(store: EpisodeStore, split: Split) -> str:
     return f"{store.path}: has no episode for {split} ({len(store.lengths)} in all): {hint}"
 
 
-def _too_short(store: EpisodeStore, episodes: np.ndarray, short: int, horizon: int, *, next_frame: bool) -> str:
-    shortest = int(episodes[np.argmin(store.lengths[episodes])])
-    largest = int(store.lengths[shortest]) - 1
-    if largest == 0:
-        return _one_row(store, shortest, next_frame=next_frame)
+def _too_short(
+    store: EpisodeStore, episodes: np.ndarray, short: np.ndarray, horizon: int, *, left_out: bool, next_frame: bool
+) -> str:
+    lengths = store.lengths[episodes]
+    if left_out and lengths.max() > 1:  # then all are too short
+        return (
+            f"{store.path}: no episode has as many steps as the horizon {horizon}; the longest has {lengths.max() - 1}"
+        )
+    if lengths.min() == 1:
+        return _one_row(store, int(episodes[np.argmin(lengths)]), next_frame=next_frame)
     return (
-        f"{store.path}: episode {short} has {store.lengths[short] - 1} steps, fewer than the horizon {horizon}; "
-        f"the largest valid horizon is {largest}"
+        f"{store.path}: episode {short[0]} has {store.lengths[short[0]] - 1} steps, fewer than the horizon {horizon}; "
+        f"the largest valid horizon is {lengths.min() - 1}, or leave such episodes out by data.leave_out_short"
     )
 
 

@@ -185,7 +185,7 @@ def _writer(path: str | Path, films: AtariFilm, overwrite: bool) -> EpisodeWrite
             "environment": "atari",
             "configuration": recording.configuration(),
             "seed": recording.seed,
-            "action_names": meanings,
+            "classes": {"actions": meanings},
             "licence": "generated; pictures of the Atari 2600 games that ale-py ships",
         },
         overwrite=overwrite,

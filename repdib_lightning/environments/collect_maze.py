@@ -123,7 +123,7 @@ def collect_maze(
             "environment": "maze",
             "configuration": asdict(recording),
             "seed": seed,
-            "action_names": list(MOVES),
+            "classes": {"actions": list(MOVES)},
             "licence": "generated",
         },
         overwrite=overwrite,

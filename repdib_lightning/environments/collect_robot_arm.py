@@ -129,7 +129,7 @@ def collect_robot_arm(
             "environment": "robot_arm",
             "configuration": asdict(recording),
             "seed": seed,
-            "action_names": list(ACTIONS),
+            "classes": {"actions": list(ACTIONS)},
             "licence": "generated; Kinova Jaco meshes from dm-control (Apache-2.0)",
         },
         overwrite=overwrite,

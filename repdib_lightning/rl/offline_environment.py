@@ -19,7 +19,7 @@ _VD4RL = "dm_control/"
 
 _FIXED = {
     CONTROL: ("task", "action_repeat", "image_size", "distractor_seed"),
-    ATARI: ("game", "frame_skip", "image_size", "side_width", "distractor_seed"),
+    ATARI: ("game", "frame_skip", "image_size", "side", "side_width", "distractor_seed"),
 }
 """Of a recording; evaluated otherwise, its return would be that of another problem, or amid clips that were seen."""
 

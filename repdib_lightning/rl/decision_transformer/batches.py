@@ -142,9 +142,9 @@ class WindowBatches:
             yield self.batch(number)
 
     @property
-    def tokens(self) -> int:
-        """Steps that are no padding in all epochs, where windows are drawn evenly."""
-        return round(float(self.windows.lengths.mean()) * self.order.samples * (self.total // self.order.batches))
+    def tokens(self) -> float:
+        """Steps that are no padding in an epoch, where windows are drawn evenly."""
+        return float(self.windows.lengths.mean()) * self.order.samples
 
     def batch(self, number: int) -> WindowBatch:
         """One batch."""

@@ -12,14 +12,15 @@ _LEVELS = 1 << 16
 def dropped(values: Tensor, share: float) -> Tensor:
     """Set a share of the elements to 0, at random, and scale the others so that the mean stays.
 
-    On a CPU the share is rounded to 1 / 65536, and four elements share one draw of 64 bits of the global generator.
+    On a CPU the share is rounded to 1 / 65536, below 1, and four elements share one draw of 64 bits of the global
+    generator.
 
     Args:
         values: any shape. share: in [0, 1).
     """
     if values.device.type != "cpu":
         return torch.dropout(values, share, True)
-    least = round(share * _LEVELS)
+    least = min(round(share * _LEVELS), _LEVELS - 1)
     if least == 0:
         return values
     count = values.numel()

@@ -17,7 +17,10 @@ from repdib_lightning.rl.decision_transformer.network import DecisionTransformer
 _BETAS = (0.9, 0.95)
 _CLIP = 1.0
 _LEAST_RATE = 0.1
-"""Of the learning rate, where it ends."""
+"""Of the learning rate: it falls no further."""
+COSINE_EPOCHS = 6
+"""Over which the learning rate falls, or over all where there are more. The published program counts tokens as steps,
+``2 * 3 * context`` for each window of the data, and trains for five epochs."""
 
 _STEPS = {"cpu": 2048}
 """Steps of windows that go through the transformer at a time; all of a batch on other devices."""
@@ -30,12 +33,13 @@ class DecisionTransformerModule(pl.LightningModule):
     """Trains a network on windows; and an encoder with it, where the windows are of pictures.
 
     AdamW with betas (0.9, 0.95), weight decay on the weights of linear layers and convolutions alone, gradients clipped
-    at a norm of 1. The learning rate rises over ``warmup_tokens``, then falls as a cosine to a tenth at ``tokens``,
-    where a token is a step of a window: published, but for the first update, which there has the whole rate.
+    at a norm of 1. The learning rate rises over ``warmup_tokens``, then falls as a cosine that would reach 0 at
+    ``tokens``, but not below a tenth; a token is a step of a window. Published, but for the first update, which there
+    has the whole rate.
 
     Args:
         network: the transformer. encoder: that is trained, pictures to (N, width); None where states are vectors.
-        learning_rate, weight_decay: AdamW's. warmup_tokens: of the rise. tokens: of the whole training.
+        learning_rate, weight_decay: AdamW's. warmup_tokens: of the rise. tokens: of the rise and fall.
 
     Attributes:
         read: tokens so far. sums: (3,) float64: of the losses, of right guesses, and of tokens since
@@ -122,7 +126,7 @@ class DecisionTransformerModule(pl.LightningModule):
 
 
 def schedule(read: int, warmup: int, tokens: int) -> float:
-    """Share of the learning rate after so many tokens: a line to 1, then a cosine that ends at a tenth."""
+    """Share of the learning rate after so many tokens: a line to 1, then a cosine down to a tenth."""
     if read < warmup:
         return read / warmup
     progress = (read - warmup) / max(1, tokens - warmup)

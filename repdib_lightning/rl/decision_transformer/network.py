@@ -13,8 +13,8 @@ from repdib_lightning.rl.decision_transformer.dropout import Dropout
 
 RETURN_RANGE = 50.0
 """What the largest return-to-go of the data counts as. Weights start with a deviation of 0.02, so its embedding begins
-as tanh of numbers of deviation 1: returns stay apart. The published program takes them as they are, which is much the
-same in Breakout and Pong, and lets tanh saturate where they are in the thousands."""
+as tanh of numbers of deviation 1: returns stay apart. The published program starts these weights evenly in (-1, 1) and
+takes returns as they are: of 20 on, in any game, tanh is saturated for most of them."""
 
 TOKENS = 3
 """Of a step: return-to-go, state, action."""
@@ -22,12 +22,14 @@ TOKENS = 3
 
 @dataclass(frozen=True)
 class Sizes:
-    """Attributes: actions: A. timesteps: of the longest episode of the data. context: T, steps of a window. layers,
-    heads, width, dropout: of the transformer. return_scale: returns-to-go are divided by it."""
+    """Attributes: actions: A. context: T, steps of a window. stride: steps between the beginnings of two windows of an
+    episode, and beginnings: how many there are in the longest one, in training. layers, heads, width, dropout: of the
+    transformer. return_scale: returns-to-go are divided by it."""
 
     actions: int
-    timesteps: int
     context: int
+    stride: int
+    beginnings: int
     layers: int
     heads: int
     width: int
@@ -39,7 +41,8 @@ class DecisionTransformer(nn.Module):
     """A causal transformer over (return-to-go, state, action) of each step (Chen et al. 2021, section 3 and Atari).
 
     Embeddings of returns, states and actions end in tanh. To each token are added a learned embedding of its place in
-    the window and one of the time step at which the window begins. The logits are read at the state tokens. A token
+    the window and one of the time step at which the window begins; of a window that begins where none did in training,
+    that of the last beginning before it. The logits are read at the state tokens. A token
     sees itself and what is before it, so what stands behind an episode's end changes nothing before it.
 
     Args:
@@ -53,14 +56,14 @@ class DecisionTransformer(nn.Module):
         width = sizes.width
         self.returns = nn.Linear(1, width)
         self.actions = nn.Embedding(sizes.actions, width)
-        self.timesteps = nn.Embedding(sizes.timesteps, width)
+        self.beginnings = nn.Embedding(sizes.beginnings, width)
         self.positions = nn.Parameter(torch.zeros(TOKENS * sizes.context, width))
         self.dropout = Dropout(sizes.dropout)
         self.blocks = nn.ModuleList(Block(sizes) for _ in range(sizes.layers))
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, sizes.actions, bias=False)
         self.apply(initialise)
-        nn.init.zeros_(self.timesteps.weight)
+        nn.init.zeros_(self.beginnings.weight)
         self.states = states  # whose own start stays
 
     def forward(self, states: Tensor, returns: Tensor, actions: Tensor, first: Tensor) -> Tensor:
@@ -98,8 +101,8 @@ class DecisionTransformer(nn.Module):
         """
         start = 0 if caches is None else caches[0].length
         places = self.positions[start : start + tokens.shape[1]]
-        began = self.timesteps(first.clamp(max=self.sizes.timesteps - 1)).unsqueeze(1)
-        hidden = self.dropout(tokens + places + began)
+        began = (first // self.sizes.stride).clamp(max=self.sizes.beginnings - 1)
+        hidden = self.dropout(tokens + places + self.beginnings(began).unsqueeze(1))
         for number, block in enumerate(self.blocks, 1):
             cache = None if caches is None else caches[number - 1]
             hidden = block(hidden, cache, wanted if number == len(self.blocks) else None)

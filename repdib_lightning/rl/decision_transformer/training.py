@@ -33,7 +33,7 @@ from repdib_lightning.records import DataSpec
 from repdib_lightning.rl.decision_transformer.batches import PictureFrames, SeenSource, VectorTable, WindowBatches
 from repdib_lightning.rl.decision_transformer.checkpoints import load_checkpoint
 from repdib_lightning.rl.decision_transformer.evaluation import ConditionedEpisodes, asked_return, game_of, scores
-from repdib_lightning.rl.decision_transformer.module import DecisionTransformerModule
+from repdib_lightning.rl.decision_transformer.module import COSINE_EPOCHS, DecisionTransformerModule
 from repdib_lightning.rl.decision_transformer.network import RETURN_RANGE, DecisionTransformer, Sizes
 from repdib_lightning.rl.decision_transformer.options import DTOptions
 from repdib_lightning.rl.decision_transformer.play import Play
@@ -170,9 +170,9 @@ class DTTraining:
         largest = float(np.abs(windows.returns).max())
         sizes = Sizes(
             actions=store.actions_spec.size,
-            timesteps=windows.longest,
+            beginnings=windows.beginnings,
             return_scale=largest / RETURN_RANGE if largest > 0 else 1.0,
-            **{name: getattr(options, name) for name in ("context", "layers", "heads", "width", "dropout")},
+            **{name: getattr(options, name) for name in ("context", "stride", "layers", "heads", "width", "dropout")},
         )
         self.module = DecisionTransformerModule(
             DecisionTransformer(sizes, states),
@@ -180,7 +180,7 @@ class DTTraining:
             learning_rate=options.learning_rate,
             weight_decay=options.weight_decay,
             warmup_tokens=options.warmup_tokens,
-            tokens=self.batches.tokens,
+            tokens=round(self.batches.tokens * max(options.epochs, COSINE_EPOCHS)),
         ).to(self.device)
 
     def _seen(self, store: EpisodeStore, windows: Windows) -> tuple[SeenSource, nn.Module]:

@@ -13,8 +13,9 @@ class Windows:
 
     A step is a row with an action. Windows begin at the first step of an episode and every ``stride`` steps after it,
     until one reaches the last step. What lies behind that is padding: an episode that is shorter than the context, or
-    the rest behind the last whole stride, counts too. With a stride of 1 these are the windows of the published
-    program, which leaves short episodes out; with one of ``context`` each step is in one window.
+    the rest behind the last whole stride, counts too. With a stride of 1 a step is in as many windows as can be; with
+    one of ``context``, in one. The published program has a window for each step but the last ``context`` of the data;
+    one that would reach over an episode's end is moved back, into the episode before where this one is short.
 
     Args:
         store: with discrete actions and rewards.
@@ -26,7 +27,7 @@ class Windows:
         timesteps: (W,) int64, time in its episode of the first step. episode_starts: (W,) int64, row of that.
         returns: (N,) float32, undiscounted return-to-go of each row of a training episode. actions: (N,) int64.
         trained: (N,) bool, whether a row is a step of a training episode.
-        longest: steps of the longest episode. best_return: of the training episodes.
+        beginnings: most windows of an episode. best_return: of the training episodes.
 
     Raises:
         UserError: no discrete actions, no finite rewards, no step to train on.
@@ -53,7 +54,7 @@ class Windows:
         change[first + steps] -= 1
         self.trained = np.cumsum(change[:-1]) > 0
         self.returns = _returns_to_go(store, self.trained, np.repeat(first + steps, steps))
-        self.longest = int(steps.max())
+        self.beginnings = int(counts.max())
         self.best_return = float(self.returns[first].max())
 
     def __len__(self) -> int:

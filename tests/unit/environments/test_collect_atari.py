@@ -67,7 +67,7 @@ def test_layout(store):
         "frame": ((1, 36, 48), "uint8")
     }
     assert (store.actions_spec.kind, store.actions_spec.size) == ("discrete", 4)
-    assert json.loads(store.attributes["action_names"]) == ["NOOP", "FIRE", "RIGHT", "LEFT"]
+    assert store.class_names == {"actions": ["NOOP", "FIRE", "RIGHT", "LEFT"]}
     kinds = {name: (factor.kind, factor.scale, factor.width) for name, factor in store.factors.items()}
     own = ("player_x", "ball_x", "ball_y", "lives", "bricks", "score")
     assert kinds == dict.fromkeys(own, ("endogenous", "continuous", 1)) | {

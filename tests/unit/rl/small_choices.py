@@ -141,8 +141,8 @@ def choices_bundle(folder: Path, *, stack: int = 1, quantised: bool = False, fea
 def network(seed: int = 0, **changes: Any) -> DecisionTransformer:
     """In evaluation mode; weights are larger than at the start, so that everything has its say."""
     given = {
-        "actions": ACTIONS, "timesteps": 20, "context": 5, "layers": 2, "heads": 2, "width": 8, "dropout": 0.0,
-        "return_scale": 2.0,
+        "actions": ACTIONS, "context": 5, "stride": 1, "beginnings": 20, "layers": 2, "heads": 2, "width": 8,
+        "dropout": 0.0, "return_scale": 2.0,
     }  # fmt: skip
     sizes = Sizes(**{**given, **changes})
     torch.manual_seed(seed)
@@ -160,7 +160,7 @@ def windows_of(sizes: Sizes, count: int = 4, steps: int | None = None, seed: int
         "states": torch.randn(count, steps, FEATURES, generator=drawn),
         "returns": torch.randn(count, steps, generator=drawn),
         "actions": torch.randint(sizes.actions, (count, steps), generator=drawn),
-        "first": torch.randint(sizes.timesteps, (count,), generator=drawn),
+        "first": torch.randint(sizes.stride * sizes.beginnings, (count,), generator=drawn),
     }
 
 

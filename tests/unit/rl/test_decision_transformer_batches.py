@@ -84,7 +84,7 @@ def test_they_can_be_had_from_any_on(store):
     for one, other in zip(list(made)[3:], later, strict=True):
         assert torch.equal(one.actions, other.actions) and torch.equal(one.seen, other.seen)
     lengths = made.windows.lengths
-    assert made.tokens == 2 * lengths.sum() == sum(batch.steps for batch in made)
+    assert 2 * made.tokens == pytest.approx(2 * lengths.sum()) == sum(batch.steps for batch in made)
 
 
 @pytest.mark.parametrize("stack", [1, 3])
@@ -216,7 +216,7 @@ def test_an_update_is_that_of_adamw(store):
     assert norm > 1.0 and rates[0] < rates[1]
     for name, weight in net.named_parameters():
         told = state[name][1].sqrt() > 1e-6  # biases of keys have no gradient but rounding
-        assert told.any() or name == "positions" or "timesteps" in name
+        assert told.any() or name == "positions" or "beginnings" in name
         torch.testing.assert_close(weight[told], named[name][told], rtol=1e-4, atol=1e-6, msg=name)
     assert made.read == 3 * batch.steps and made.sums[2] == 3 * batch.steps
 
@@ -231,7 +231,7 @@ def test_only_weights_of_linear_layers_and_convolutions_decay(tmp_path):
     assert decayed["weight_decay"] == 0.1 and kept["weight_decay"] == 0.0
     assert of_decayed | of_kept == set(names.values()) and not of_decayed & of_kept
     assert all(name.endswith("weight") for name in of_decayed) and any("encoder.stacks" in n for n in of_decayed)
-    embeddings = {"network.actions.weight", "network.timesteps.weight", "network.positions"}
+    embeddings = {"network.actions.weight", "network.beginnings.weight", "network.positions"}
     assert embeddings <= of_kept and not any("norm" in name for name in of_decayed)
 
 
@@ -240,3 +240,13 @@ def test_the_learning_rate_rises_and_falls_to_a_tenth():
     assert schedule(350, 100, 1100) == pytest.approx(0.5 * (1 + math.cos(math.pi / 4)))
     assert schedule(1000, 100, 1100) == schedule(1100, 100, 1100) == schedule(5000, 100, 1100) == 0.1
     assert schedule(7, 0, 7) == 0.1 and schedule(7, 7, 7) == 1.0
+
+
+@pytest.mark.parametrize(("epochs", "wanted"), [(5, [0.93, 0.75, 0.5, 0.25, 0.1]), (8, [0.96, 0.85, 0.69, 0.5, 0.31])])
+def test_the_learning_rate_falls_over_six_epochs_as_published_or_over_more(tmp_path, epochs, wanted):
+    """``final_tokens = 2 * len(train_dataset) * context * 3``, of which an epoch counts ``context`` a window."""
+    training = DTTraining(options(random_store(tmp_path / "d.h5"), epochs=epochs, warmup_tokens=0, **FRESH))
+    training._build(tmp_path)
+    made, steps = training.module, training.batches.windows.lengths.sum()
+    ends = [schedule(epoch * steps, made.warmup_tokens, made.tokens) for epoch in range(1, epochs + 1)]
+    assert ends[:5] == pytest.approx(wanted, abs=0.005) and ends[-1] == pytest.approx(0.1)

@@ -40,7 +40,14 @@ def test_what_the_data_do_not_tell_is_left_to_the_environment():
 
 @pytest.mark.parametrize(
     ("option", "given"),
-    [("game", "pong"), ("frame_skip", 3), ("image_size", 64), ("side_width", 20), ("distractor_seed", 6)],
+    [
+        ("game", "pong"),
+        ("frame_skip", 3),
+        ("image_size", 64),
+        ("side", "left"),
+        ("side_width", 20),
+        ("distractor_seed", 6),
+    ],
 )
 def test_another_problem_than_the_recorded_one_is_refused(option, given):
     recorded = RECORDED["seed" if option == "distractor_seed" else option]

@@ -23,7 +23,8 @@ def slow_logits(net, states, returns, actions, first):
         tokens.append(torch.tanh(net.returns.weight[:, 0] * returns[t] / sizes.return_scale + net.returns.bias))
         tokens.append(torch.tanh(net.states.linear(states[t])))
         tokens.append(torch.tanh(net.actions.weight[actions[t]]))
-    hidden = [token + net.positions[i] + net.timesteps.weight[first] for i, token in enumerate(tokens)]
+    began = net.beginnings.weight[min(int(first) // sizes.stride, sizes.beginnings - 1)]
+    hidden = [token + net.positions[i] + began for i, token in enumerate(tokens)]
     for block in net.blocks:
         normed = [block.norm_attention(token) for token in hidden]
         queries, keys, values = zip(*[block.attention.inputs(token).chunk(3) for token in normed], strict=True)
@@ -41,9 +42,9 @@ def slow_logits(net, states, returns, actions, first):
     return torch.stack([net.head(net.norm(token)) for token in hidden[1::3]])
 
 
-@pytest.mark.parametrize("steps", [1, 3, 5])
-def test_it_is_the_published_network(steps):
-    net = network()
+@pytest.mark.parametrize(("steps", "stride"), [(1, 1), (3, 1), (5, 1), (5, 4)])
+def test_it_is_the_published_network(steps, stride):
+    net = network(stride=stride)
     given = windows_of(net.sizes, steps=steps)
     logits = net(**given)
     assert logits.shape == (4, steps, ACTIONS) and logits.std() > 0.1
@@ -73,15 +74,26 @@ def test_each_logit_hangs_on_all_that_came_before(changed):
         other = {**given, changed: given[changed].clone()}
         other[changed][:, step] += 1.0
         assert ((net(**other) - net(**given))[:, step:].abs().amax(-1) > 1e-5).all()
-    other = {**given, "first": (given["first"] + 1) % net.sizes.timesteps}
+    other = {**given, "first": (given["first"] + 1) % net.sizes.beginnings}
     assert ((net(**other) - net(**given)).abs().amax(-1) > 1e-5).all()
+
+
+def test_a_window_that_begins_where_none_did_in_training_counts_as_the_last_that_did():
+    net = network(stride=3, beginnings=4)
+    given = windows_of(net.sizes, count=40)
+    began = torch.arange(40)
+    trained = (began // 3 * 3).clamp(max=9)  # 0, 3, 6, 9
+    assert torch.equal(net(**{**given, "first": began}), net(**{**given, "first": trained}))
+    same = {name: part[:1].expand(4, *part.shape[1:]) for name, part in given.items()}
+    four = net(**{**same, "first": torch.tensor([0, 3, 6, 9])})
+    assert all((four[i] - four[j]).abs().max() > 1e-4 for i in range(4) for j in range(i))
 
 
 @pytest.mark.parametrize("dropout", [0.0, 0.2])
 def test_gradients_reach_every_parameter(dropout):
     net = network(dropout=dropout).train()
     given = windows_of(net.sizes, count=40)
-    given["first"] = torch.arange(40) % net.sizes.timesteps
+    given["first"] = torch.arange(40) % net.sizes.beginnings
     F.cross_entropy(net(**given).flatten(0, 1), given["actions"].flatten()).backward()
     for name, weight in net.named_parameters():
         assert weight.grad is not None, name
@@ -99,13 +111,13 @@ def test_a_part_of_the_tokens_is_what_it_is_among_all():
 
 
 def test_the_start_is_gpts():
-    sizes = Sizes(9, 50, 30, 2, 4, 64, 0.1, 1.0)
+    sizes = Sizes(9, 30, 1, 50, 2, 4, 64, 0.1, 1.0)
     torch.manual_seed(0)
     net = DecisionTransformer(sizes, LatentStates(torch.zeros(256), torch.ones(256), 64))
     for name, weight in net.named_parameters():
         if "norm" in name:
             assert (weight == float(name.endswith("weight"))).all(), name
-        elif name in ("positions", "timesteps.weight") or name.endswith("bias"):
+        elif name in ("positions", "beginnings.weight") or name.endswith("bias"):
             assert not weight.any(), name
         else:
             assert weight.std().item() == pytest.approx(0.02, rel=0.25), name
@@ -164,6 +176,7 @@ def test_dropout_is_that_of_the_generator_and_has_its_gradient():
     assert not torch.equal(dropped(values, 0.5), first)
     layer = Dropout(0.5)
     assert layer.eval()(values) is values and (layer.train()(values) == 0).any() and dropped(values, 0.0) is values
+    assert dropped(values, 1 - 1e-9).isfinite().all()
 
 
 def test_dropout_is_in_training_alone():
