@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,8 @@ from repdib_lightning.environments.collect_emoji_styles import collect_emoji_sty
 from repdib_lightning.environments.collect_maze import collect_maze
 from repdib_lightning.environments.collect_robot_arm import collect_robot_arm
 from repdib_lightning.environments.collect_smartwatch import collect_smartwatch
+from repdib_lightning.evaluation import group_drawing
+from repdib_lightning.evaluation.factor_classifier import judge_of
 from repdib_lightning.experiments.suite_file import read_suite
 
 ROOT = Path(__file__).parents[2]
@@ -95,17 +98,17 @@ def here(tmp_path, monkeypatch, recording, maze_recording, control_recording, at
     monkeypatch.chdir(tmp_path)
     Path("data").mkdir()
     for name in ("walker_walk_video", "walker_walk_demo", "vd4rl_walker_walk_video"):
-        shutil.copy(control_recording, f"data/{name}.h5")
-    shutil.copy(maze_recording, "data/gridworld.h5")
+        Path(f"data/{name}.h5").hardlink_to(control_recording)
+    Path("data/gridworld.h5").hardlink_to(maze_recording)
     for name in ("emoji_styles", "pacs_elephants"):
-        shutil.copy(drawings / f"{name}.h5", "data")
+        Path(f"data/{name}.h5").hardlink_to(drawings / f"{name}.h5")
     for name in ("activities", "mmact", "smartwatch"):
         Path(f"data/{name}.h5").hardlink_to(clips / f"{name}.h5")
     for name in ("breakout", "pong", "qbert", "seaquest"):
         for stem in (name, f"{name}_probe", f"{name}_demo", f"dqn_{name}"):
             Path(f"data/{stem}.h5").hardlink_to(atari_recording)
-    shutil.copy(recording, "data/robot_arm.h5")
-    shutil.copy(recording, "data/robot_arm_demo.h5")
+    for name in ("robot_arm", "robot_arm_demo"):
+        Path(f"data/{name}.h5").hardlink_to(recording)
     return tmp_path
 
 
@@ -161,6 +164,7 @@ def test_every_configuration_trains(here, layers):
     configurations = [argument for name in layers for argument in ("--config", name)]
     small = [*SMALL, *FEW_FRAMES] if "urlb/" in layers[0] else SMALL
     small = [*small, "--data.workers", "0"] if layers[0] == PAPER_ATARI else small
+    small = [*small, "--data.batch_size", "2"] if "paper/pacs" in layers else small
     assert main(["fit", *configurations, *small, *ON_A_CPU, "--run", "runs/x"]) == 0
     assert Path("runs/x/checkpoints/step-00000003.ckpt").is_file()
     written = {path.name for path in Path("runs/x").iterdir()}
@@ -229,6 +233,7 @@ def readme_commands() -> list[list[str]]:
 
 
 def test_every_command_of_the_readme(here, monkeypatch):
+    monkeypatch.setattr(group_drawing, "judge_of", partial(judge_of, steps=20))
     monkeypatch.syspath_prepend(ROOT / "tests/unit/data/importers")
     from test_image_folder import write_csv, write_images
     from vd4rl_files import as_npz, record, write_npz
@@ -252,9 +257,11 @@ def test_every_command_of_the_readme(here, monkeypatch):
         elif command[:2] == ["finetune", "dt"]:
             small = [*SMALL_DT, "--epochs", "1"]
         elif command[0] == "finetune":
-            small = ["--steps", "10", "--hidden", "32", "--batch_size", "16", "--episodes", "2"]
+            small = ["--steps", "10", "--hidden", "32", "--batch_size", "16", "--episodes", "2", "--film", "1"]
         if command[:2] == ["collect", "control"]:
-            small = ["--samples", "500", "--workers", "1"]
+            small = ["--samples", "200", "--workers", "1"]
+        if command[:2] == ["collect", "shapes"]:
+            small = ["--samples", "500"]
         if "urlb/walker_repdib" in command:
             small = [*EXPLORED_AT_ONCE, *QUANTISER_AT_ONCE]
         elif command[0] == "fit":
@@ -385,10 +392,11 @@ def test_the_suite_of_exploration(here, capsys):
     words = [*EXPLORED_AT_ONCE, *QUANTISER_AT_ONCE]
     small = {key.removeprefix("--"): yaml.safe_load(value) for key, value in zip(words[::2], words[1::2], strict=True)}
     small |= {"data.image_size": 64, "trainer.log_every_n_steps": 1}
+    small |= {"data.frames": 6000, "data.snapshots": [5000], "data.seed_frames": 4000, "data.hold_out_every": 3}
     few = {"frames": 3000, "seed_frames": 1000, "batch_size": 4, "episodes": 2, "evaluate_every": 1000, "hidden": 8}
     for each in (plan["finetune"], plan["grids"]["trained_along"]["finetune"]):
         each["with"] |= few
-        each["snapshots"] = [20000]
+        each["snapshots"] = [5000]
     for grid in plan["grids"].values():
         grid |= {"baseline": "scratch", "settings": {"repdib": small, "scratch": {"pretrained": False}}}
     del plan["finetune"]["runs"]["walker_run"]
