@@ -35,9 +35,7 @@ class EpisodesAtOnce:
         Returns:
             returns (n,), undiscounted; and of each filmed episode the pictures that the agent saw, (T, H, W, 3) uint8.
         """
-        random = np.random.default_rng(self._seed)
-        seeds = random.integers(2**31, size=len(self._environments)).tolist()
-        seen = [env.reset(seed=seed)[0] for env, seed in zip(self._environments, seeds, strict=True)]
+        seen = self._reset()
         returns, running = np.zeros(len(seen)), np.ones(len(seen), bool)
         films: list[list[np.ndarray]] = [[] for _ in range(film)]
         while running.any():
@@ -53,6 +51,11 @@ class EpisodesAtOnce:
                 returns[i] += float(reward)
                 running[i] = not (terminated or truncated)
         return returns, [np.stack(frames) for frames in films]
+
+    def _reset(self) -> list[dict[str, np.ndarray]]:
+        """Reset each copy once, to its own episode; what is seen there."""
+        seeds = np.random.default_rng(self._seed).integers(2**31, size=len(self._environments)).tolist()
+        return [env.reset(seed=seed)[0] for env, seed in zip(self._environments, seeds, strict=True)]
 
     def close(self) -> None:
         """Close the environments."""

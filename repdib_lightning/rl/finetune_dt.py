@@ -126,13 +126,14 @@ def check_dt(**given: Any) -> None:
         return
     from repdib_lightning.data.episodes import EpisodeStore
     from repdib_lightning.rl.decision_transformer.windows import Windows
-    from repdib_lightning.rl.offline_environment import evaluated_environment, open_discrete
+    from repdib_lightning.rl.offline_environment import evaluated_environment
+    from repdib_lightning.rl.offline_evaluation import open_copies
 
     store = EpisodeStore(options.data)
     Windows(store, options.context, options.stride)
     chosen = evaluated_environment(store, options.env, options.env_options or {})
     if chosen is not None and store.actions_spec is not None:
-        for environment in open_discrete(*chosen, 1, store.actions_spec.size):
+        for environment in open_copies(*chosen, 1, store.actions_spec):
             environment.close()
 
 

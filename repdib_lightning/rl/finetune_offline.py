@@ -150,14 +150,15 @@ def _check(agent: str, given: Mapping[str, Any]) -> None:
     if not options.data.exists():
         return
     from repdib_lightning.data.episodes import EpisodeStore
-    from repdib_lightning.rl.offline_environment import evaluated_environment, open_all
+    from repdib_lightning.rl.offline_environment import evaluated_environment
+    from repdib_lightning.rl.offline_evaluation import open_copies
     from repdib_lightning.rl.transitions import Transitions
 
     store = EpisodeStore(options.data)
     Transitions(store, rewarded=agent != "bc").check_batch(options.batch_size)
     chosen = evaluated_environment(store, options.env, options.env_options or {})
     if chosen is not None and store.actions_spec is not None:
-        for environment in open_all(*chosen, 1, store.actions_spec.size):
+        for environment in open_copies(*chosen, 1, store.actions_spec):
             environment.close()
 
 

@@ -6,11 +6,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium
-
 from repdib_lightning.data.episodes import EpisodeStore
 from repdib_lightning.errors import UserError
-from repdib_lightning.rl.environment import open_environment
 from repdib_lightning.rl.offline_options import NO_ENVIRONMENT
 
 CONTROL, ATARI = "repdib/Control-v0", "repdib/Atari-v0"
@@ -103,33 +100,3 @@ def recorded_options(store: EpisodeStore) -> dict[str, Any] | None:
         task = environment.removeprefix(_VD4RL)
         return {"task": task, "action_repeat": 2, "image_size": shape[-1], "quality": "paper"}
     return None
-
-
-def open_all(name: str, options: Mapping[str, Any], count: int, actions: int) -> list[gymnasium.Env[Any, Any]]:
-    """Open copies of an environment.
-
-    Raises:
-        UserError: no such environment, bad options, or other actions than the data's.
-    """
-    opened = [open_environment(name, options)]
-    space = opened[0].action_space
-    if not isinstance(space, gymnasium.spaces.Box) or space.shape != (actions,):
-        opened[0].close()
-        raise UserError(f"--env {name}: its actions are {space}, those of the data are continuous, {actions} wide")
-    return opened + [open_environment(name, options) for _ in range(count - 1)]
-
-
-def open_discrete(name: str, options: Mapping[str, Any], count: int, actions: int) -> list[gymnasium.Env[Any, Any]]:
-    """Open copies of an environment with discrete actions.
-
-    Raises:
-        UserError: no such environment, bad options, or another number of actions than the data's.
-    """
-    opened = [open_environment(name, options)]
-    space = opened[0].action_space
-    if not isinstance(space, gymnasium.spaces.Discrete) or space.n != actions:
-        opened[0].close()
-        discrete = isinstance(space, gymnasium.spaces.Discrete)
-        there = f"has {space.n} actions" if discrete else f"has no discrete actions but {space}"  # type: ignore[attr-defined]
-        raise UserError(f"--env {name}: {there}, the data have {actions} discrete ones")
-    return opened + [open_environment(name, options) for _ in range(count - 1)]

@@ -9,11 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import lightning.pytorch as pl
 import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
-from lightning.pytorch.plugins.environments import SLURMEnvironment
 
 from repdib_lightning.bottlenecks import Identity
 from repdib_lightning.callbacks import exit_codes
@@ -22,7 +20,6 @@ from repdib_lightning.data.files import whole_file
 from repdib_lightning.devices import resolve_device
 from repdib_lightning.encoders import ConvolutionalEncoder
 from repdib_lightning.encoders.base import Encoder
-from repdib_lightning.errors import UserError
 from repdib_lightning.evaluation.features import check_compatible, stacked
 from repdib_lightning.export.bundle import save_bundle
 from repdib_lightning.export.frozen import FrozenEncoder
@@ -32,9 +29,11 @@ from repdib_lightning.rl.devices import check_device
 from repdib_lightning.rl.episodes_at_once import EpisodesAtOnce
 from repdib_lightning.rl.given_bundle import checked_bundle
 from repdib_lightning.rl.networks import ShiftedPictures, StandardisedLatents
-from repdib_lightning.rl.offline_environment import evaluated_environment, open_all
+from repdib_lightning.rl.offline_environment import evaluated_environment
+from repdib_lightning.rl.offline_evaluation import open_episodes
 from repdib_lightning.rl.offline_options import OfflineOptions
 from repdib_lightning.rl.offline_progress import OfflineProgress
+from repdib_lightning.rl.one_pass import one_pass_trainer
 from repdib_lightning.rl.options import CONFIGURATION, plain
 from repdib_lightning.rl.outcome import write_outcome
 from repdib_lightning.rl.policy_file import save_policy
@@ -91,14 +90,9 @@ class OfflineTraining:
         if chosen is None:
             return None
         assert self.store.actions_spec is not None
-        copies = open_all(*chosen, options.episodes, self.store.actions_spec.size)
-        try:
-            return EpisodesAtOnce(copies, self.encoder.spec, options.seed + 1)
-        except UserError as error:
-            for copy in copies:
-                copy.close()
-            whose = f"--data {options.data}" if options.encoder is None else f"--encoder {options.encoder}"
-            raise UserError(f"{whose}: does not fit --env {chosen[0]}: {error}") from error
+        whose = f"--data {options.data}" if options.encoder is None else f"--encoder {options.encoder}"
+        asked: dict[str, Any] = {"count": options.episodes, "seed": options.seed + 1, "whose": whose}
+        return open_episodes(EpisodesAtOnce, chosen, self.store.actions_spec, self.encoder.spec, **asked)
 
     def _build(self) -> tuple[Latents | Pictures, BehaviourCloning]:
         """What is seen of the data, encoded where the encoder is frozen; and the agent that sees it."""
@@ -140,19 +134,10 @@ class OfflineTraining:
         )
         evaluate = None if self.evaluation is None else partial(self._evaluate, self.evaluation)
         self.progress = OfflineProgress(folder, options.evaluate_every, options.steps, evaluate)
-        trainer = pl.Trainer(
-            max_epochs=1,
-            limit_train_batches=options.steps,
-            accelerator="cpu" if self.device.type == "cpu" else self.device.type,
-            devices=1 if self.device.index is None else [self.device.index],
-            logger=TensorBoardLogger(folder, name="", version=""),
-            callbacks=[self.progress],
-            log_every_n_steps=min(50, options.steps),
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            default_root_dir=folder,
-            plugins=[SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else None,
+        logger = TensorBoardLogger(folder, name="", version="")
+        every = min(50, options.steps)
+        trainer = one_pass_trainer(
+            folder, self.device, batches=options.steps, callback=self.progress, logger=logger, log_every=every
         )
         with exit_codes():
             trainer.fit(self.agent, train_dataloaders=batches)

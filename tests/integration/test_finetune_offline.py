@@ -191,7 +191,7 @@ def test_imported_vd4rl_is_evaluated_in_paper_quality(here, monkeypatch):
         opened.append((name, options))
         return open_environment(name, options)
 
-    monkeypatch.setattr("repdib_lightning.rl.offline_environment.open_environment", noted)
+    monkeypatch.setattr("repdib_lightning.rl.offline_evaluation.open_environment", noted)
     monkeypatch.setattr("repdib_lightning.rl.offline_training.EpisodesAtOnce.run", lambda *_: (np.zeros(2), []))
     assert finetune("td3bc", "vd4rl.h5", "--run", "r", *TINY, *FRESH) == 0
     options = {"task": "walker_walk", "action_repeat": 2, "image_size": PIXELS, "quality": "paper", "evaluation": True}

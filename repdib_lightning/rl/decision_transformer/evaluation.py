@@ -38,9 +38,7 @@ class ConditionedEpisodes(EpisodesAtOnce):
             returns (n,), undiscounted; and of each filmed episode the pictures that the agent saw in its first
             :data:`FILMED_STEPS` steps, (T, H, W, 3) uint8.
         """
-        random = np.random.default_rng(self._seed)
-        seeds = random.integers(2**31, size=self.count).tolist()
-        seen = [env.reset(seed=seed)[0] for env, seed in zip(self._environments, seeds, strict=True)]
+        seen = self._reset()
         play = begin(self.count, self._seed)
         returns, playing = np.zeros(self.count), np.arange(self.count)
         films: list[list[np.ndarray]] = [[] for _ in range(film)]

@@ -8,11 +8,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import lightning.pytorch as pl
 import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
-from lightning.pytorch.plugins.environments import SLURMEnvironment
 from torch import Tensor, nn
 
 from repdib_lightning.bottlenecks import Identity
@@ -43,7 +41,9 @@ from repdib_lightning.rl.decision_transformer.states import CodeStates, EncodedS
 from repdib_lightning.rl.decision_transformer.windows import WindowOrder, Windows
 from repdib_lightning.rl.devices import check_device
 from repdib_lightning.rl.given_bundle import checked_bundle
-from repdib_lightning.rl.offline_environment import evaluated_environment, open_discrete
+from repdib_lightning.rl.offline_environment import evaluated_environment
+from repdib_lightning.rl.offline_evaluation import open_episodes
+from repdib_lightning.rl.one_pass import one_pass_trainer
 from repdib_lightning.rl.options import CONFIGURATION, plain
 from repdib_lightning.rl.outcome import write_outcome
 from repdib_lightning.versions import versions
@@ -106,14 +106,9 @@ class DTTraining:
         if chosen is None:
             return None
         assert self.store.actions_spec is not None
-        copies = open_discrete(*chosen, options.episodes, self.store.actions_spec.size)
-        try:
-            return ConditionedEpisodes(copies, self.encoder.spec, options.seed + 1)
-        except UserError as error:
-            for copy in copies:
-                copy.close()
-            whose = f"--data {options.data}" if options.encoder is None else f"--encoder {options.encoder}"
-            raise UserError(f"{whose}: does not fit --env {chosen[0]}: {error}") from error
+        whose = f"--data {options.data}" if options.encoder is None else f"--encoder {options.encoder}"
+        asked: dict[str, Any] = {"count": options.episodes, "seed": options.seed + 1, "whose": whose}
+        return open_episodes(ConditionedEpisodes, chosen, self.store.actions_spec, self.encoder.spec, **asked)
 
     def train(self, folder: Path) -> None:
         """Learn, from the newest checkpoint in the folder on; progress goes into it."""
@@ -133,29 +128,16 @@ class DTTraining:
         )
         if state is not None:
             self.progress.go_on(state, self.module)
-        if len(self.batches):
-            self._fit(folder, logger)
+        left = len(self.batches)
+        if left:  # for Lightning the rest of the training is one epoch: its numbers are those of the batches
+            trainer = one_pass_trainer(
+                folder, self.device, batches=left, callback=self.progress, logger=logger, log_every=left
+            )
+            with exit_codes():
+                trainer.fit(self.module, train_dataloaders=self.batches)
         logger.finalize("success")
         (folder / TensorBoardLogger.NAME_HPARAMS_FILE).unlink(missing_ok=True)  # says nothing
         self.module.eval().to(self.device)
-
-    def _fit(self, folder: Path, logger: TensorBoardLogger) -> None:
-        trainer = pl.Trainer(
-            max_epochs=1,  # for Lightning the rest of the training is one: its numbers are those of the batches
-            limit_train_batches=len(self.batches),
-            accelerator="cpu" if self.device.type == "cpu" else self.device.type,
-            devices=1 if self.device.index is None else [self.device.index],
-            logger=logger,
-            callbacks=[self.progress],
-            log_every_n_steps=len(self.batches),
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            default_root_dir=folder,
-            plugins=[SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else None,
-        )
-        with exit_codes():
-            trainer.fit(self.module, train_dataloaders=self.batches)
 
     def _build(self, folder: Path) -> None:
         """Encode the data where the encoder is frozen; then batches and network."""

@@ -12,8 +12,9 @@ from offline_stores import register_quadrants
 from small_choices import register_choices
 
 from repdib_lightning.errors import UserError
-from repdib_lightning.records import ArraySpec
-from repdib_lightning.rl.offline_environment import ATARI, evaluated_environment, open_discrete
+from repdib_lightning.records import ActionSpec, ArraySpec
+from repdib_lightning.rl.offline_environment import ATARI, evaluated_environment
+from repdib_lightning.rl.offline_evaluation import open_copies
 
 RECORDED = {
     "game": "breakout", "frame_skip": 4, "sticky": 0.25, "image_size": 84, "side": "right", "side_width": 42,
@@ -66,7 +67,7 @@ def test_other_environments_take_their_own_options():
 
 
 def test_copies_with_discrete_actions_are_opened():
-    opened = open_discrete(register_choices(), {}, 3, 3)
+    opened = open_copies(register_choices(), {}, 3, ActionSpec("discrete", 3))
     assert len({id(env.unwrapped) for env in opened}) == 3
 
 
@@ -82,5 +83,5 @@ def test_other_actions_than_those_of_the_data_are_refused(monkeypatch, name, act
     closed = []
     monkeypatch.setattr(gymnasium.Wrapper, "close", lambda self: closed.append(self))
     with pytest.raises(UserError) as caught:
-        open_discrete(name, {}, 3, actions)
+        open_copies(name, {}, 3, ActionSpec("discrete", actions))
     assert str(caught.value) == f"--env {name}: {told}" and len(closed) == 1

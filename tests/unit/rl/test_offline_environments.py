@@ -12,8 +12,10 @@ import pytest
 from offline_stores import register_quadrants
 
 from repdib_lightning.errors import UserError
-from repdib_lightning.records import ArraySpec
-from repdib_lightning.rl.offline_environment import evaluated_environment, open_all, recorded_options
+from repdib_lightning.records import ActionSpec, ArraySpec
+from repdib_lightning.rl import offline_evaluation
+from repdib_lightning.rl.offline_environment import evaluated_environment, recorded_options
+from repdib_lightning.rl.offline_evaluation import open_copies
 
 CONTROL = "repdib/Control-v0"
 RECORDED = {
@@ -123,7 +125,7 @@ def test_no_evaluation():
 
 
 def test_copies_are_opened(monkeypatch):
-    opened = open_all(register_quadrants(), {}, 3, 2)
+    opened = open_copies(register_quadrants(), {}, 3, ActionSpec("continuous", 2))
     assert len({id(env.unwrapped) for env in opened}) == 3
     assert all(env.action_space.shape == (2,) for env in opened)
 
@@ -138,5 +140,21 @@ def test_other_actions_than_those_of_the_data_are_refused(monkeypatch, name, act
     monkeypatch.setattr(gymnasium.Wrapper, "close", lambda self: closed.append(self))
     wanted = rf"^--env {name}: its actions are {space}, those of the data are continuous, {actions} wide$"
     with pytest.raises(UserError, match=wanted):
-        open_all(name, {}, 3, actions)
+        open_copies(name, {}, 3, ActionSpec("continuous", actions))
     assert len(closed) == 1
+
+
+def test_where_a_later_copy_does_not_open_none_stays_open(monkeypatch):
+    closed, opened = [], []
+    monkeypatch.setattr(gymnasium.Wrapper, "close", lambda self: closed.append(self))
+
+    def open_two(name, options):
+        if len(opened) == 2:
+            raise UserError("no more memory")
+        opened.append(gymnasium.make(name))
+        return opened[-1]
+
+    monkeypatch.setattr(offline_evaluation, "open_environment", open_two)
+    with pytest.raises(UserError, match="no more memory"):
+        open_copies(register_quadrants(), {}, 3, ActionSpec("continuous", 2))
+    assert len(opened) == 2 and closed == opened
