@@ -9,7 +9,7 @@ import pytest
 from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
-PICTURES = {"01_mazes": 4, "02_factors": 5, "03_activities": 5, "04_exploration": 6}
+PICTURES = {"01_mazes": 4, "02_factors": 5, "03_activities": 5, "04_exploration": 6, "05_atari": 6}
 """Name -> pictures that its outputs hold."""
 
 
