@@ -76,14 +76,16 @@ def attend_in_parts(queries: Tensor, keys: Tensor, values: Tensor, places: Tenso
     Returns:
         (B, heads, m, D).
     """
-    queries = queries / math.sqrt(queries.shape[-1])
+    batch = queries.shape[:2]
+    queries = (queries / math.sqrt(queries.shape[-1])).flatten(0, 1)
+    keys, values = keys.flatten(0, 1), values.flatten(0, 1)  # copied once here, else by each product of each part
     parts = []
-    for asking, at in zip(queries.split(_PART, dim=2), places.split(_PART), strict=True):
+    for asking, at in zip(queries.split(_PART, dim=1), places.split(_PART), strict=True):
         last = int(at[-1]) + 1
         hidden = torch.zeros(len(at), last).masked_fill(~_seen(at, last), -math.inf)
-        weights = (asking @ keys[:, :, :last].transpose(-1, -2) + hidden).softmax(-1)
-        parts.append(dropped(weights, share) @ values[:, :, :last])
-    return torch.cat(parts, dim=2)
+        weights = torch.baddbmm(hidden, asking, keys[:, :last].transpose(1, 2)).softmax(-1)
+        parts.append(torch.bmm(dropped(weights, share), values[:, :last]))
+    return torch.cat(parts, dim=1).unflatten(0, batch)
 
 
 def _seen(places: Tensor, keys: int) -> Tensor:

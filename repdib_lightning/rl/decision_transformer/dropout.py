@@ -26,7 +26,7 @@ def dropped(values: Tensor, share: float) -> Tensor:
     count = values.numel()
     draws = torch.empty(-(-count // 4), dtype=torch.int64).random_(-(1 << 63), None)
     kept = draws.view(torch.int16)[:count].view(values.shape) >= least - _LEVELS // 2
-    return values * kept.to(values.dtype).mul_(_LEVELS / (_LEVELS - least))
+    return values * (kept * (_LEVELS / (_LEVELS - least))).to(values.dtype)
 
 
 class Dropout(nn.Module):
